@@ -1,0 +1,315 @@
+"""Hamilton-Jacobi reachability in imagination: the safety value and the fallback policy (Eq. 4 and 5).
+
+The learner never sees an environment. It needs an `Imagination`: something that steps latents under actions and
+knows their margin. A world model is one, the true car is another, and both are learned by the same code.
+
+V(z) = min(l(z), max_a Q(z, a)), where Q(z, a) is the value *after* a: Q(z, a) = V(z') for z' = step(z, a).
+"""
+
+import copy
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from lerobot_latentsafe.world_models.base import Latent, map_latent, select
+
+Starts = Callable[[int], Latent]
+"""Draws a batch of latents from which imagination starts: encoded dataset windows."""
+
+
+class Imagination(Protocol):
+    """What reachability needs to know of the world; latents are batch-first structures of tensors."""
+
+    def step(self, latent: Latent, action: Tensor) -> Latent:
+        """Next latent under actions (B, A) in [-1, 1]."""
+
+    def features(self, latent: Latent) -> Tensor:
+        """(B, D), what actor and critic read."""
+
+    def margin(self, latent: Latent) -> Tensor:
+        """Bounded margin l(z): (B,)."""
+
+    def ended(self, latent: Latent) -> Tensor:
+        """Whether the episode is over in this latent: bool (B,). Nothing can fail after that."""
+
+
+def safety_bellman_target(margin: Tensor, next_value: Tensor, gamma: float) -> Tensor:
+    """Eq. 5, the time-discounted safety Bellman backup: (1 - gamma) l + gamma min(l, V').
+
+    gamma = 0 gives the margin itself, gamma -> 1 the undiscounted minimum over time.
+    """
+    return (1 - gamma) * margin + gamma * torch.minimum(margin, next_value)
+
+
+@dataclass
+class ReachabilityConfig:
+    """Sizes and schedule of the reachability actor-critic.
+
+    Attributes:
+        critic_hidden, actor_hidden: widths of the hidden layers.
+        activation: `tanh` or `relu`.
+        horizon: imagined steps before a start is drawn anew (25 in the paper).
+        steps: gradient steps.
+        batch_size: imagined states a gradient step; with discrete actions each is backed up under all of them.
+        lr, actor_lr: AdamW step sizes, decayed over the second half.
+        gamma: the final discount; 1 - gamma is annealed from `gamma_start` geometrically over `anneal` of the run,
+            after `warmup` of the run at gamma = 0.
+        tau: rate of the target network.
+        pool: imagined states kept; a part is imagined anew every `refresh` steps.
+        greedy: share of imagined trajectories that follow the current fallback policy, which lets imagination visit
+            what the fallback would see; the others act at random.
+    """
+
+    critic_hidden: tuple[int, ...] = (100, 100)
+    actor_hidden: tuple[int, ...] = (256, 256)
+    activation: str = "tanh"
+    horizon: int = 25
+    steps: int = 8000
+    batch_size: int = 512
+    lr: float = 1e-3
+    actor_lr: float = 3e-4
+    gamma: float = 0.9999
+    gamma_start: float = 0.8
+    warmup: float = 0.04
+    anneal: float = 0.46
+    tau: float = 0.05
+    pool: int = 102_400
+    refresh: int = 100
+    greedy: float = 0.5
+
+
+def _mlp(sizes: list[int], activation: str) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for i, (n_in, n_out) in enumerate(zip(sizes[:-1], sizes[1:])):
+        layers.append(nn.Linear(n_in, n_out))
+        if i < len(sizes) - 2:
+            layers.append({"tanh": nn.Tanh, "relu": nn.ReLU}[activation]())
+    return nn.Sequential(*layers)
+
+
+class SafetyCritic(nn.Module):
+    """Q(z, a) and the fallback policy over standardised features, for a discrete or a continuous action space.
+
+    Args:
+        feature_dim: D.
+        action_dim: A.
+        candidates: (K, A) in [-1, 1], the discrete action set, or None for continuous actions.
+    """
+
+    def __init__(
+        self, feature_dim: int, action_dim: int, candidates: Tensor | None, config: ReachabilityConfig
+    ):
+        super().__init__()
+        self.register_buffer("feature_mean", torch.zeros(feature_dim))
+        self.register_buffer("feature_std", torch.ones(feature_dim))
+        self.register_buffer("candidates", candidates)
+        self.discrete = candidates is not None
+        n_out = len(candidates) if self.discrete else 1
+        n_in = feature_dim + (0 if self.discrete else action_dim)
+        self.q = _mlp([n_in, *config.critic_hidden, n_out], config.activation)
+        self.actor = (
+            None if self.discrete else _mlp([feature_dim, *config.actor_hidden, action_dim], config.activation)
+        )
+
+    def set_feature_scale(self, features: Tensor) -> None:
+        """Standardise by these features (N, D)."""
+        self.feature_mean.copy_(features.mean(0))
+        self.feature_std.copy_(features.std(0) + 1e-2)
+
+    def standardise(self, features: Tensor) -> Tensor:
+        return (features - self.feature_mean) / self.feature_std
+
+    def best_q(self, x: Tensor) -> Tensor:
+        """max_a Q over standardised features (..., D) -> (...,)."""
+        return self.q(x).amax(-1) if self.discrete else self.q_of(x, self.act(x))
+
+    def q_of(self, x: Tensor, action: Tensor) -> Tensor:
+        """Q(z, a) for continuous actions (..., A)."""
+        return self.q(torch.cat([x, action], -1)).squeeze(-1)
+
+    def act(self, x: Tensor) -> Tensor:
+        """The fallback action argmax_a Q in [-1, 1]: (..., D) -> (..., A)."""
+        if self.discrete:
+            return self.candidates[self.q(x).argmax(-1)]
+        return torch.tanh(self.actor(x))
+
+    def value(self, features: Tensor, margin: Tensor) -> Tensor:
+        """V = min(l, max_a Q) at raw features (..., D) with bounded margin (...,)."""
+        return torch.minimum(margin, self.best_q(self.standardise(features)))
+
+    def fallback(self, features: Tensor) -> Tensor:
+        """Safety-preserving action in [-1, 1] at raw features: (..., D) -> (..., A)."""
+        return self.act(self.standardise(features))
+
+
+def discount(progress: float, config: ReachabilityConfig) -> float:
+    """gamma at a share of the run: 0, then 1 - gamma falls geometrically from gamma_start's to gamma's."""
+    if progress < config.warmup:
+        return 0.0
+    share = min(1.0, (progress - config.warmup) / config.anneal)
+    first, last = 1 - config.gamma_start, 1 - config.gamma
+    return 1 - first * (last / first) ** share
+
+
+class LatentReachability:
+    """DDQN (discrete actions) or DDPG (continuous) on thousands of imagined states in parallel.
+
+    Imagined states live in a pool of tensors; every `refresh` steps a slice of it is imagined anew from fresh starts.
+    With discrete actions the successors under *all* actions are imagined, so each update backs up every action.
+    """
+
+    def __init__(
+        self, imagination: Imagination, critic: SafetyCritic, starts: Starts, config: ReachabilityConfig,
+        generator: torch.Generator | None = None,
+    ):  # fmt: skip
+        self.imagination, self.critic, self.starts, self.config = imagination, critic, starts, config
+        self.generator = generator
+        self.target = copy.deepcopy(critic).requires_grad_(False)
+        groups = [{"params": critic.q.parameters(), "lr": config.lr}]
+        if critic.actor is not None:
+            groups.append({"params": critic.actor.parameters(), "lr": config.actor_lr})
+        fused = critic.feature_mean.device.type in ("cpu", "cuda")
+        self.optimizer = torch.optim.AdamW(groups, weight_decay=0.0, fused=fused)
+        self.step_count = 0
+        self.chunk = max(1, min(2048, config.pool // config.horizon))
+        self.pool: dict[str, Tensor] = {}
+        self._fill_pool()
+
+    # -- imagination ---------------------------------------------------------------------------------------------
+
+    @torch.no_grad()
+    def imagine(self) -> dict[str, Tensor]:
+        """Roll `chunk` starts out for `horizon` steps.
+
+        Returns:
+            x (N, D) features and l (N,) margin; next_x (N, K, D), next_l and ended (N, K), where K successors are
+            those of all candidates, or of the one action (N, A) taken when actions are continuous.
+        """
+        critic, config, n = self.critic, self.config, self.chunk
+        latent = self.starts(n)
+        greedy = self._rand(n) < config.greedy
+        rows: list[dict[str, Tensor]] = []
+        for _ in range(config.horizon):
+            features = self.imagination.features(latent)
+            x = critic.standardise(features)
+            action, choice = self._explore(x, greedy)
+            tried = critic.candidates.unsqueeze(0).expand(n, -1, -1) if critic.discrete else action[:, None]
+            k = tried.shape[1]
+            repeated = map_latent(latent, lambda t, k=k: t.repeat_interleave(k, 0))
+            after = self.imagination.step(repeated, tried.flatten(0, 1))
+            next_features, ended = self.imagination.features(after), self.imagination.ended(after)
+            rows.append(
+                {
+                    "x": x,
+                    "l": self.imagination.margin(latent),
+                    "action": action,
+                    "next_x": critic.standardise(next_features).unflatten(0, (n, k)),
+                    "next_l": self.imagination.margin(after).unflatten(0, (n, k)),
+                    "ended": ended.unflatten(0, (n, k)),
+                }
+            )
+            taken = torch.arange(n, device=x.device) * k + choice
+            latent = select(after, taken)
+            if ended[taken].any():
+                latent = map_latent(
+                    latent, lambda old, new: torch.where(_like(ended[taken], old), new, old), self.starts(n)
+                )
+        return {key: torch.cat([row[key] for row in rows]) for key in rows[0]}
+
+    def _explore(self, x: Tensor, greedy: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions (n, A) and the index of the successor they lead to (n,)."""
+        n, critic = len(x), self.critic
+        if critic.discrete:
+            random = torch.randint(len(critic.candidates), (n,), generator=self.generator, device=x.device)
+            choice = torch.where(greedy, critic.q(x).argmax(-1), random)
+            return critic.candidates[choice], choice
+        shape = critic.act(x).shape
+        random = 2 * self._rand(*shape) - 1
+        noisy = (critic.act(x) + 0.3 * torch.randn(shape, generator=self.generator, device=x.device)).clamp(-1, 1)
+        return torch.where(greedy[:, None], noisy, random), torch.zeros(n, dtype=torch.long, device=x.device)
+
+    def _rand(self, *shape: int) -> Tensor:
+        return torch.rand(*shape, generator=self.generator, device=self.critic.feature_mean.device)
+
+    @torch.no_grad()
+    def _fill_pool(self) -> None:
+        self.critic.set_feature_scale(self.imagination.features(self.starts(4096)))
+        self.target.load_state_dict(self.critic.state_dict())
+        n_chunks = max(1, self.config.pool // (self.chunk * self.config.horizon))
+        chunks = [self.imagine() for _ in range(n_chunks)]
+        self.pool = {key: torch.cat([c[key] for c in chunks]) for key in chunks[0]}
+        self._oldest = 0
+
+    @torch.no_grad()
+    def _refresh_pool(self) -> None:
+        fresh = self.imagine()
+        n, size = len(fresh["l"]), len(self.pool["l"])
+        for key, value in fresh.items():
+            self.pool[key][self._oldest : self._oldest + n] = value
+        self._oldest = (self._oldest + n) % size
+
+    # -- learning ------------------------------------------------------------------------------------------------
+
+    def update(self) -> dict[str, float]:
+        """One gradient step; returns metrics."""
+        config = self.config
+        progress = self.step_count / config.steps
+        decay = min(1.0, (self.step_count + 1) / 200) * (1.0 if progress < 0.5 else 0.02 ** (2 * progress - 1))
+        for group, lr in zip(self.optimizer.param_groups, (config.lr, config.actor_lr)):
+            group["lr"] = lr * decay
+        if self.step_count and self.step_count % config.refresh == 0:
+            self._refresh_pool()
+        gamma = discount(progress, config)
+        picked = torch.randint(
+            len(self.pool["l"]), (config.batch_size,), generator=self.generator, device=self.pool["l"].device
+        )
+        batch = {key: value[picked] for key, value in self.pool.items()}
+        target = self._td_target(batch, gamma)
+        critic_loss = F.mse_loss(self._predict(batch), target)
+        loss = critic_loss
+        if self.critic.actor is not None:
+            loss = loss - self._actor_objective(batch["x"])
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        self.optimizer.step()
+        with torch.no_grad():
+            for old, new in zip(self.target.parameters(), self.critic.parameters()):
+                old.lerp_(new, config.tau)
+        self.step_count += 1
+        if not math.isfinite(critic_loss.item()):
+            raise FloatingPointError(
+                f"critic loss is {critic_loss.item()} at step {self.step_count}; lower --reachability.lr"
+            )
+        return {"critic_loss": critic_loss.item(), "gamma": gamma, "value": target.mean().item()}
+
+    def _predict(self, batch: dict[str, Tensor]) -> Tensor:
+        if self.critic.discrete:
+            return self.critic.q(batch["x"])
+        return self.critic.q_of(batch["x"], batch["action"])[:, None]
+
+    @torch.no_grad()
+    def _td_target(self, batch: dict[str, Tensor], gamma: float) -> Tensor:
+        """Targets of Q(z, a) = V(z'), Eq. 5 read at the successor: (batch, K)."""
+        x, l, ended = batch["next_x"], batch["next_l"], batch["ended"]
+        if self.critic.discrete:  # double Q: the online network chooses, the target network judges
+            choice = self.critic.q(x).argmax(-1, keepdim=True)
+            future = self.target.q(x).gather(-1, choice).squeeze(-1)
+        else:
+            future = self.target.best_q(x)
+        return torch.where(ended, l, safety_bellman_target(l, future, gamma))
+
+    def _actor_objective(self, x: Tensor) -> Tensor:
+        """Mean Q of the actor's actions, with the critic's weights held fixed."""
+        frozen = {name: p.detach() for name, p in self.critic.q.named_parameters()}
+        inputs = torch.cat([x, self.critic.act(x)], -1)
+        return torch.func.functional_call(self.critic.q, frozen, (inputs,)).mean()
+
+
+def _like(mask: Tensor, tensor: Tensor) -> Tensor:
+    """mask (B,) shaped to broadcast over tensor (B, ...)."""
+    return mask.reshape(-1, *[1] * (tensor.ndim - 1))

@@ -1,0 +1,124 @@
+"""The contract between a world model and the rest: encode episodes, step in imagination, be differentiable.
+
+A `Latent` is a batch-first dict of tensors and Markov by construction: everything the model needs to go on is in it.
+Within models actions are in [-1, 1] and images in [0, 1]; `action[t]` is the action that *led to* frame t.
+"""
+
+import abc
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import draccus
+import torch
+from torch import Tensor, nn
+
+Latent = dict[str, Tensor]
+
+
+def map_latent(latent: Latent, function: Callable[..., Tensor], *others: Latent) -> Latent:
+    """Apply a function to each tensor of a latent (and to the same tensors of others)."""
+    return {key: function(value, *(other[key] for other in others)) for key, value in latent.items()}
+
+
+def select(latent: Latent, index: Tensor | slice) -> Latent:
+    """Rows of a batch of latents."""
+    return map_latent(latent, lambda t: t[index])
+
+
+@dataclass
+class Clip:
+    """A batch of aligned windows of episodes, what a world model trains on.
+
+    Attributes:
+        images: camera key -> (B, T, C, H, W) in [0, 1].
+        state: (B, T, S) proprioception.
+        action: (B, T, A) in [-1, 1], the action that led to each frame; zero where is_first.
+        is_first: bool (B, T), frames with no past.
+        valid: bool (B, T), False for padding.
+        failure: (B, T), 1 failing, 0 safe, -1 unlabelled.
+        terminal: (B, T), 1 where the episode is over, 0 where it goes on, -1 unknown.
+    """
+
+    images: dict[str, Tensor]
+    state: Tensor
+    action: Tensor
+    is_first: Tensor
+    valid: Tensor
+    failure: Tensor
+    terminal: Tensor
+
+
+@dataclass
+class WorldModelConfig(draccus.ChoiceRegistry, abc.ABC):
+    """Base of world-model configurations; `type` chooses among the registered ones.
+
+    Attributes:
+        image_size: side of the square images the model reads; others are area-averaged to it.
+        clip_length: frames of a training window.
+    """
+
+    image_size: int = 128
+    clip_length: int = 64
+
+    @property
+    def type(self) -> str:
+        return self.get_choice_name(type(self))
+
+    @abc.abstractmethod
+    def build(self, image_keys: list[str], state_dim: int, action_dim: int) -> "WorldModel":
+        """The world model with fresh weights."""
+
+
+class WorldModel(nn.Module, abc.ABC):
+    """z_t ~ encoder(z_t | z_hat_t, o_t), z_hat_{t+1} ~ transition(z_t, a_t) (Section III)."""
+
+    feature_dim: int
+
+    @abc.abstractmethod
+    def initial(self, batch_size: int) -> Latent:
+        """The latent before anything has been seen."""
+
+    @abc.abstractmethod
+    def step(self, latent: Latent, action: Tensor) -> Latent:
+        """Imagine: next latent (B, ...) under actions (B, A) in [-1, 1]."""
+
+    @abc.abstractmethod
+    def correct(self, predicted: Latent, images: dict[str, Tensor], state: Tensor) -> Latent:
+        """Posterior of a predicted latent given an observation: images (B, C, H, W) in [0, 1], state (B, S)."""
+
+    @abc.abstractmethod
+    def features(self, latent: Latent) -> Tensor:
+        """(..., D), what margin, actor and critic read."""
+
+    @abc.abstractmethod
+    def ended(self, latent: Latent) -> Tensor:
+        """Whether imagination has left the data because episodes end there: bool (...,)."""
+
+    @abc.abstractmethod
+    def loss(self, clip: Clip) -> tuple[Tensor, Tensor, dict[str, float]]:
+        """Training loss, features (B, T, D) of the posterior for the co-trained margin, and metrics."""
+
+    def observe(
+        self, latent: Latent | None, action: Tensor | None, images: dict[str, Tensor], state: Tensor
+    ) -> Latent:
+        """Posterior after acting and seeing: one tick of the filter. `latent` None starts an episode."""
+        if latent is None:
+            latent = self.initial(len(state))
+            action = torch.zeros(len(state), self.action_dim, device=state.device)
+        return self.correct(self.step(latent, action), images, state)
+
+    def encode(self, clip: Clip) -> Latent:
+        """Filtered posteriors of every frame of a clip: tensors (B, T, ...)."""
+        latents: list[Latent] = []
+        latent = fresh = self.initial(len(clip.state))
+        for t in range(clip.state.shape[1]):
+            first = clip.is_first[:, t]
+            latent = map_latent(
+                latent, lambda old, new, f=first: torch.where(f.reshape(-1, *[1] * (old.ndim - 1)), new, old), fresh
+            )
+            images = {key: value[:, t] for key, value in clip.images.items()}
+            latent = self.correct(self.step(latent, clip.action[:, t]), images, clip.state[:, t])
+            latents.append(latent)
+        return {key: torch.stack([z[key] for z in latents], 1) for key in latents[0]}
+
+    action_dim: int
