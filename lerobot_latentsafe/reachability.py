@@ -16,7 +16,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from lerobot_latentsafe.world_models.base import Latent, map_latent, select
+from lerobot_latentsafe.margin import FailureMargin
+from lerobot_latentsafe.world_models.base import Latent, WorldModel, map_latent, select
 
 Starts = Callable[[int], Latent]
 """Draws a batch of latents from which imagination starts: encoded dataset windows."""
@@ -36,6 +37,18 @@ class Imagination(Protocol):
 
     def ended(self, latent: Latent) -> Tensor:
         """Whether the episode is over in this latent: bool (B,). Nothing can fail after that."""
+
+
+class LatentImagination:
+    """A frozen world model and failure margin behind the `Imagination` protocol."""
+
+    def __init__(self, world_model: WorldModel, margin: FailureMargin):
+        self.world_model = world_model.eval().requires_grad_(False)
+        self.failure_margin = margin.eval().requires_grad_(False)
+        self.step, self.features, self.ended = world_model.step, world_model.features, world_model.ended
+
+    def margin(self, latent: Latent) -> Tensor:
+        return self.failure_margin.bounded(self.world_model.features(latent))
 
 
 def safety_bellman_target(margin: Tensor, next_value: Tensor, gamma: float) -> Tensor:
@@ -65,9 +78,9 @@ class ReachabilityConfig:
             what the fallback would see; the others act at random.
     """
 
-    critic_hidden: tuple[int, ...] = (100, 100)
+    critic_hidden: tuple[int, ...] = (128, 128, 128)
     actor_hidden: tuple[int, ...] = (256, 256)
-    activation: str = "tanh"
+    activation: str = "relu"
     horizon: int = 25
     steps: int = 8000
     batch_size: int = 512
@@ -79,7 +92,7 @@ class ReachabilityConfig:
     anneal: float = 0.46
     tau: float = 0.05
     pool: int = 102_400
-    refresh: int = 100
+    refresh: int = 500
     greedy: float = 0.5
 
 

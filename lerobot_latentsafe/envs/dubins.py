@@ -146,12 +146,12 @@ class DubinsEnv(gym.Env):
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}
     variants = ("continuous", "discrete", "anywhere")
 
-    def __init__(self, variant: str = "continuous", max_episode_steps: int = 80, image_size: int = 128,
+    def __init__(self, variant: str = "continuous", episode_length: int = 80, image_size: int = 128,
                  render_mode: str = "rgb_array"):  # fmt: skip
         if variant not in self.variants:
             raise ValueError(f"variant is {variant!r}; expected one of {', '.join(self.variants)}")
         self.variant, self.render_mode = variant, render_mode
-        self._max_episode_steps = max_episode_steps
+        self._max_episode_steps = episode_length
         self.task_description = "drive to the right edge without entering the red disc"
         self.task = self.task_description
         self.renderer = Renderer(image_size)

@@ -1,0 +1,6 @@
+"""World models behind one contract; importing this registers their configurations."""
+
+from lerobot_latentsafe.world_models.base import Clip, Latent, WorldModel, WorldModelConfig
+from lerobot_latentsafe.world_models.rssm import RSSM, RSSMConfig
+
+__all__ = ["RSSM", "Clip", "Latent", "RSSMConfig", "WorldModel", "WorldModelConfig"]

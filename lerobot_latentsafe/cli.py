@@ -1,0 +1,67 @@
+"""`latentsafe <verb> --a.b=c`: LeRobot-style options, one dataclass a verb."""
+
+import importlib
+import logging
+import sys
+
+VERBS: dict[str, tuple[str, str]] = {
+    "collect": ("lerobot_latentsafe.commands:Collect", "record labelled episodes of a simulated task as a LeRobotDataset"),
+    "cache": ("lerobot_latentsafe.commands:Cache", "decode a dataset's frames once, so that training does not have to"),
+    "train-reachability": (
+        "lerobot_latentsafe.commands:TrainReachability",
+        "learn the safety value and the fallback in a trained world model's imagination",
+    ),
+    "calibrate": ("lerobot_latentsafe.commands:Calibrate", "choose epsilon on held-out episodes and store the evidence"),
+    "wrap": ("lerobot_latentsafe.commands:Wrap", "write a filter and the policy it shields as one self-contained folder"),
+    "push": ("lerobot_latentsafe.commands:Push", "push a filter, or a shielded policy, to the Hub with its card"),
+    "eval-monitor": ("lerobot_latentsafe.commands:EvalMonitor", "compare a filter's verdicts with the exact safe set (Table 1)"),
+    "eval-shield": ("lerobot_latentsafe.commands:EvalShield", "run a policy bare and shielded from the same starts"),
+    "path": ("lerobot_latentsafe.commands:PathOf", "print the folder of a committed checkpoint, for LeRobot's commands"),
+}  # fmt: skip
+
+INTRODUCTION = """Latent safety filters for LeRobot.
+
+usage: latentsafe <verb> [--option=value ...]      latentsafe <verb> --help shows a verb's options
+
+From episodes to a shielded policy:
+  1. latentsafe collect --source=random --repo_id=me/car --root=data/car    (or record with lerobot-record)
+  2. latentsafe cache --dataset.repo_id=me/car --dataset.root=data/car --output_dir=data/car_cache
+  3. lerobot-train --policy.type=latentsafe --dataset.repo_id=me/car_cache --dataset.root=data/car_cache ...
+  4. latentsafe train-reachability --policy.path=<checkpoint> --dataset.root=data/car_cache --output_dir=filter
+  5. latentsafe eval-shield --policy.path=filter --base_policy_path=<your policy> --env.type=latentsafe_dubins ...
+
+verbs:"""
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Entry point of the console command `latentsafe`."""
+    argv = sys.argv[1:] if argv is None else argv
+    if not argv or argv[0] in ("-h", "--help", "help"):
+        print(INTRODUCTION)
+        for verb, (_, what) in VERBS.items():
+            print(f"  {verb:20s} {what}")
+        return
+    verb, *options = argv
+    if verb not in VERBS:
+        sys.exit(f"latentsafe: unknown verb {verb!r}; expected one of {', '.join(VERBS)}")
+    # torchcodec without system FFmpeg logs a page of traceback; LeRobot then falls back to pyav by itself.
+    logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
+    module, name = VERBS[verb][0].split(":")
+    command = getattr(importlib.import_module(module), name)
+
+    import draccus
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    register_third_party_plugins()
+    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s")
+    try:
+        draccus.parse(command, args=options).run()
+    except (ValueError, OSError, RuntimeError, ImportError, KeyError) as e:
+        # A user's mistake gets its message; a bug of ours can be traced with --traceback through LATENTSAFE_DEBUG.
+        if logging.getLogger().isEnabledFor(logging.DEBUG):
+            raise
+        sys.exit(f"latentsafe {verb}: {e.args[0] if isinstance(e, KeyError) else e}")
+
+
+if __name__ == "__main__":
+    main()

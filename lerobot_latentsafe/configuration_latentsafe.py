@@ -1,0 +1,121 @@
+"""Configuration of the latent safety filter as a LeRobot policy."""
+
+from dataclasses import dataclass, field
+
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.configs.types import NormalizationMode
+from lerobot.optim import AdamConfig, CosineDecayWithWarmupSchedulerConfig
+
+from lerobot_latentsafe.reachability import ReachabilityConfig
+from lerobot_latentsafe.world_models import RSSMConfig, WorldModelConfig
+
+STAGES = ("untrained", "world_model", "reachability")
+MODES = ("filter", "monitor")
+
+
+@PreTrainedConfig.register_subclass("latentsafe")
+@dataclass
+class LatentSafeConfig(PreTrainedConfig):
+    """A world model, a failure margin and a safety actor-critic that shield another policy.
+
+    Attributes:
+        world_model: its type and sizes.
+        margin_hidden, margin_layers: the failure margin's MLP (Eq. 3; 2 layers of 16 in the paper).
+        margin_delta: delta of Eq. 3.
+        margin_weight: weight of Eq. 3 in the training loss.
+        failure_specification: name of the failure labels: a dataset column or a sidecar file.
+        frame_cache: folder made by `latentsafe cache`; by default the one in the dataset's folder, if there is one.
+        reachability: actor-critic sizes and schedule.
+        action_candidates: the discrete action set in robot units, e.g. [[-1.25], [0.0], [1.25]]; None: continuous.
+        stage: how far training has come: untrained, world_model, reachability. Set by the training commands.
+        epsilon: the filter intervenes where V of the predicted next latent is at or below this.
+        calibration: the evidence epsilon was chosen on; written by `latentsafe calibrate`.
+        mode: `filter` overrides unsafe actions, `monitor` only reports what it would have done.
+        deadline_ms: if set, a decision that took longer is not trusted, and the fallback acts.
+        base_policy_path: the policy to shield: a folder, a Hub id or the name of a committed checkpoint.
+        cameras: the image features the filter reads, by default all of the dataset's.
+        fps, state_names, action_names, action_low, action_high, state_mean, state_std: what the filter was trained
+            on, in robot units; filled in from the dataset.
+    """
+
+    world_model: WorldModelConfig = field(default_factory=RSSMConfig)
+    margin_hidden: int = 16
+    margin_layers: int = 2
+    margin_delta: float = 0.75
+    margin_weight: float = 10.0
+    failure_specification: str = "failure"
+    frame_cache: str | None = None
+
+    reachability: ReachabilityConfig = field(default_factory=ReachabilityConfig)
+    action_candidates: list[list[float]] | None = None
+    stage: str = "untrained"
+
+    epsilon: float = 0.0
+    calibration: dict[str, float] = field(default_factory=dict)
+    mode: str = "filter"
+    deadline_ms: float | None = None
+    base_policy_path: str | None = None
+
+    cameras: list[str] | None = None
+    fps: int | None = None
+    state_names: list[str] | None = None
+    action_names: list[str] | None = None
+    action_low: list[float] | None = None
+    action_high: list[float] | None = None
+    state_mean: list[float] | None = None
+    state_std: list[float] | None = None
+
+    optimizer_lr: float = 1e-3
+    grad_clip_norm: float = 100.0
+    scheduler_steps: int = 3000
+    drop_n_last_frames: int = 3
+
+    # Images stay in [0, 1]; state and actions are scaled by the model with the numbers it stores itself.
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: {
+            "VISUAL": NormalizationMode.IDENTITY,
+            "STATE": NormalizationMode.IDENTITY,
+            "ACTION": NormalizationMode.IDENTITY,
+            "ENV": NormalizationMode.IDENTITY,
+        }
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.stage not in STAGES:
+            raise ValueError(f"stage is {self.stage!r}; expected one of {', '.join(STAGES)}")
+        if self.mode not in MODES:
+            raise ValueError(f"--policy.mode is {self.mode!r}; expected one of {', '.join(MODES)}")
+        if self.margin_delta <= 0:
+            raise ValueError(f"--policy.margin_delta is {self.margin_delta}; expected a positive number")
+
+    @property
+    def observation_delta_indices(self) -> list[int] | None:
+        """Frames t .. t + T - 1; with a frame cache the policy cuts the window itself, from `index`."""
+        return None if self.frame_cache else list(range(self.world_model.clip_length))
+
+    @property
+    def action_delta_indices(self) -> list[int] | None:
+        """The action that led to each frame: LeRobot's frames are (o_t, a_t taken after o_t)."""
+        return None if self.frame_cache else list(range(-1, self.world_model.clip_length - 1))
+
+    @property
+    def reward_delta_indices(self) -> None:
+        return None
+
+    def get_optimizer_preset(self) -> AdamConfig:
+        return AdamConfig(lr=self.optimizer_lr, weight_decay=0.0, grad_clip_norm=self.grad_clip_norm)
+
+    def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
+        return CosineDecayWithWarmupSchedulerConfig(
+            num_warmup_steps=100,
+            num_decay_steps=self.scheduler_steps,
+            peak_lr=self.optimizer_lr,
+            decay_lr=self.optimizer_lr / 20,
+        )
+
+    def validate_features(self) -> None:
+        if not self.robot_state_feature:
+            raise ValueError("latentsafe needs observation.state (proprioception); the dataset has none")
+        if not self.action_feature:
+            raise ValueError("latentsafe needs an action feature; the dataset has none")

@@ -1,0 +1,270 @@
+"""The latent safety filter as a LeRobot policy.
+
+`forward` is the training loss of world model and failure margin, so `lerobot-train --policy.type=latentsafe` trains
+them. `select_action` is the fallback policy; given a base policy, it is the base policy, shielded.
+"""
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import torch
+from lerobot.policies.pretrained import PreTrainedPolicy
+from torch import Tensor
+
+from lerobot_latentsafe.checkpoint import CheckpointError, check_sealed, resolve_checkpoint, seal
+from lerobot_latentsafe.configuration_latentsafe import STAGES, LatentSafeConfig
+from lerobot_latentsafe.datasets.clips import ClipReader
+from lerobot_latentsafe.datasets.frame_cache import to_model_images
+from lerobot_latentsafe.filter import FilterDecision
+from lerobot_latentsafe.margin import FailureMargin, hinge_loss
+from lerobot_latentsafe.reachability import SafetyCritic
+from lerobot_latentsafe.shield import BasePolicy, Shield
+from lerobot_latentsafe.world_models.base import Latent
+
+logger = logging.getLogger(__name__)
+
+BASE_FOLDER = "base_policy"
+
+
+class UntrainedFilterError(RuntimeError):
+    """The checkpoint has not been trained far enough for what is asked of it."""
+
+
+class LatentSafePolicy(PreTrainedPolicy):
+    """World model, failure margin, safety critic and, optionally, the base policy they shield."""
+
+    config_class = LatentSafeConfig
+    name = "latentsafe"
+
+    def __init__(self, config: LatentSafeConfig, dataset_stats=None, dataset_meta=None, **kwargs: Any):
+        super().__init__(config)
+        self.reader: ClipReader | None = None
+        if dataset_meta is not None:
+            self.reader = ClipReader.of_dataset(config, dataset_meta)
+            _adopt_dataset(config, dataset_meta, dataset_stats or dataset_meta.stats)
+        if config.action_low is None:
+            raise UntrainedFilterError(
+                "this latentsafe policy has no dataset and no checkpoint: train one with lerobot-train "
+                "--policy.type=latentsafe --dataset.repo_id=..., or load one with --policy.path=..."
+            )
+        config.validate_features()
+        n_actions = len(config.action_low)
+        self.world_model = config.world_model.build(config.cameras, len(config.state_mean), n_actions)
+        self.margin = FailureMargin(self.world_model.feature_dim, config.margin_hidden, config.margin_layers)
+        for name in ("action_low", "action_high", "state_mean", "state_std"):
+            self.register_buffer(name, torch.tensor(getattr(config, name), dtype=torch.float32), persistent=False)
+        candidates = None
+        if config.action_candidates is not None:
+            candidates = self.normalise_action(torch.tensor(config.action_candidates, dtype=torch.float32))
+        self.critic = SafetyCritic(self.world_model.feature_dim, n_actions, candidates, config.reachability)
+        self._base: list[BasePolicy] = []  # in a list, so that its weights are not ours
+        self.shield = Shield(self)
+        if config.base_policy_path:
+            self.attach(config.base_policy_path)
+
+    # -- units ---------------------------------------------------------------------------------------------------
+
+    @property
+    def device(self) -> torch.device:
+        return self.action_low.device
+
+    def normalise_action(self, action: Tensor) -> Tensor:
+        """Robot units -> [-1, 1] by the dataset's range."""
+        return 2 * (action - self.action_low) / (self.action_high - self.action_low) - 1
+
+    def denormalise_action(self, action: Tensor) -> Tensor:
+        """[-1, 1] -> robot units."""
+        return self.action_low + (action + 1) / 2 * (self.action_high - self.action_low)
+
+    def normalise_state(self, state: Tensor) -> Tensor:
+        return (state.float() - self.state_mean) / self.state_std
+
+    def model_images(self, images: Tensor) -> Tensor:
+        return to_model_images(images, self.config.world_model.image_size)
+
+    def hold_action(self, batch_size: int) -> Tensor:
+        """What to do when nothing can be known: zero motion, or the nearest the range allows."""
+        return torch.zeros_like(self.action_low).clamp(self.action_low, self.action_high).repeat(batch_size, 1)
+
+    # -- training (stage 1) --------------------------------------------------------------------------------------
+
+    def get_optim_params(self) -> list:
+        return [*self.world_model.parameters(), *self.margin.parameters()]
+
+    def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
+        """World-model loss plus the weighted hinge loss of the margin (Eq. 3)."""
+        if self.reader is None:
+            raise UntrainedFilterError(
+                "forward needs the dataset's labels: build the policy through lerobot-train or make_policy(ds_meta=...)"
+            )
+        clip = self.reader.read(batch, self)
+        loss, features, metrics = self.world_model.loss(clip)
+        margin = self.margin(features)
+        failure = torch.where(clip.valid, clip.failure, -1)
+        margin_loss = hinge_loss(margin, failure, self.config.margin_delta)
+        loss = loss + self.config.margin_weight * margin_loss
+        labelled = failure >= 0
+        correct = ((margin < 0) == (failure == 1))[labelled].float().mean()
+        if self.training:
+            self.config.stage = STAGES[1]
+        return loss, {**metrics, "loss_margin": margin_loss.item(), "margin_accuracy": correct.item()}
+
+    @torch.no_grad()
+    def value(self, latent: Latent) -> Tensor:
+        """V(z) = min(l(z), max_a Q(z, a)) of latents (B, ...) -> (B,)."""
+        self.require_stage("reachability")
+        features = self.world_model.features(latent)
+        return self.critic.value(features, self.margin.bounded(features))
+
+    # -- deployment ----------------------------------------------------------------------------------------------
+
+    @property
+    def base(self) -> BasePolicy | None:
+        return self._base[0] if self._base else None
+
+    def attach(self, path: str | Path) -> None:
+        """Shield the policy at `path`: folder, Hub id or committed name."""
+        base = BasePolicy(path, self.config.device)
+        own, theirs = self.config.action_feature, base.config.action_feature
+        if theirs is None or tuple(own.shape) != tuple(theirs.shape):
+            raise ValueError(
+                f"base policy {path} acts in {getattr(theirs, 'shape', None)}, the filter in {own.shape} "
+                f"({', '.join(self.config.action_names or [])}); they must share one action space"
+            )
+        self.config.input_features = {**base.config.input_features, **self.config.input_features}
+        self.config.base_policy_path = str(path)
+        self._base = [base]
+
+    def reset(self) -> None:
+        """Start an episode."""
+        self.shield.reset()
+        if self.base:
+            self.base.reset()
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """The shielded base action, or the fallback's action if there is no base policy: (B, A) in robot units."""
+        return self.decide(batch).action
+
+    @torch.no_grad()
+    def decide(self, batch: dict[str, Tensor], age_s: float = 0.0) -> FilterDecision:
+        """Like `select_action`, with the whole decision."""
+        self.require_stage("reachability")
+        if self.base is None:
+            decision = self.shield(batch, None, age_s)
+            return decision
+        try:
+            proposed = self.base.propose(batch)
+        except Exception:
+            if self.config.mode == "monitor":
+                raise
+            logger.exception("base policy failed; the fallback acts")
+            proposed = None
+        decision = self.shield(batch, proposed, age_s)
+        if decision.intervened.any():
+            self.base.replan()
+        return decision
+
+    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """A chunk of one: (B, 1, A). A longer one would be filtered on stale observations."""
+        return self.select_action(batch).unsqueeze(1)
+
+    def require_stage(self, stage: str) -> None:
+        """Raise unless training has come at least this far."""
+        if STAGES.index(self.config.stage) < STAGES.index(stage):
+            command = {
+                "world_model": "lerobot-train --policy.type=latentsafe",
+                "reachability": "latentsafe train-reachability --policy.path=...",
+            }[stage]
+            raise UntrainedFilterError(
+                f"this filter's stage is {self.config.stage!r}, {stage!r} is needed: its safety critic was never "
+                f"trained. Run {command} first"
+            )
+
+    # -- files ---------------------------------------------------------------------------------------------------
+
+    def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
+        config, base_path = self.config, self.config.base_policy_path
+        if self.base:
+            self.base.save(save_directory / BASE_FOLDER)
+            config.base_policy_path = BASE_FOLDER
+        try:
+            super()._save_pretrained(save_directory, state_dict=state_dict)
+        finally:
+            config.base_policy_path = base_path
+        seal(save_directory)
+
+    @classmethod
+    def from_pretrained(
+        cls, pretrained_name_or_path: str | Path | None, *, config: LatentSafeConfig | None = None,
+        revision: str | None = None, strict: bool = True, **kwargs: Any,
+    ) -> "LatentSafePolicy":  # fmt: skip
+        """Load from a folder, a committed name or a Hub id; refuses what is cut, edited or of another type."""
+        from lerobot.configs.policies import PreTrainedConfig
+
+        if pretrained_name_or_path is None:
+            raise CheckpointError(
+                "a latentsafe policy needs a trained filter: give --policy.path=<filter> "
+                "(with --policy.base_policy_path=<policy to shield>) instead of --policy.type=latentsafe"
+            )
+        hub = {k: kwargs.pop(k) for k in ("cache_dir", "token", "local_files_only", "force_download") if k in kwargs}
+        folder = resolve_checkpoint(pretrained_name_or_path, revision, **{k: v for k, v in hub.items() if v})
+        if config is None:
+            config = PreTrainedConfig.from_pretrained(folder)
+        if not isinstance(config, LatentSafeConfig):
+            raise CheckpointError(
+                f"{pretrained_name_or_path} is a {config.type!r} policy, expected a 'latentsafe' filter; "
+                "policies to be shielded go to --base_policy_path"
+            )
+        check_sealed(folder)
+        if config.base_policy_path == BASE_FOLDER and (folder / BASE_FOLDER).is_dir():
+            config.base_policy_path = str(folder / BASE_FOLDER)
+        try:
+            return super().from_pretrained(folder, config=config, strict=True, **kwargs)
+        except RuntimeError as e:
+            raise CheckpointError(f"weights of {folder} do not fit its config.json: {e}") from e
+
+    def generate_model_card(self, dataset_repo_id: str, model_type: str, license: str | None,
+                            tags: list[str] | None, cfg=None, dataset_meta=None):  # fmt: skip
+        """A card that says what the filter was trained on, how epsilon was set, and what it is not."""
+        from lerobot_latentsafe.model_card import make_model_card
+
+        return make_model_card(self.config, dataset_repo_id, license, tags)
+
+
+def _adopt_dataset(config: LatentSafeConfig, meta, stats: dict) -> None:
+    """Fill units and ranges in from a dataset, or check that it matches what the filter was trained on."""
+    action, state = meta.features["action"], meta.features["observation.state"]
+    found = {
+        "fps": int(meta.fps),
+        "action_names": list(action["names"] or []),
+        "state_names": list(state["names"] or []),
+    }
+    for name, value in found.items():
+        known = getattr(config, name)
+        if known is not None and known != value:
+            raise ValueError(
+                f"{meta.repo_id} has {name} = {value}, this filter was trained with {known}; "
+                "train a new filter or use a dataset recorded with the same robot and rate"
+            )
+        setattr(config, name, value)
+    if config.action_low is None:
+        low, high = _list(stats["action"]["min"]), _list(stats["action"]["max"])
+        if any(h - l <= 0 for l, h in zip(low, high)):
+            raise ValueError(f"action of {meta.repo_id} never changes in some dimension: min {low}, max {high}")
+        config.action_low, config.action_high = low, high
+        config.state_mean = _list(stats["observation.state"]["mean"])
+        config.state_std = [max(s, 1e-3) for s in _list(stats["observation.state"]["std"])]
+    # The data's actions decide the candidates' range check.
+    for candidate in config.action_candidates or []:
+        inside = all(lo - 1e-4 <= a <= hi + 1e-4 for lo, a, hi in zip(config.action_low, candidate, config.action_high))
+        if len(candidate) != len(config.action_low) or not inside:
+            raise ValueError(
+                f"action candidate {candidate} is outside of what {meta.repo_id} covers: "
+                f"{config.action_low} to {config.action_high}"
+            )
+
+
+def _list(values) -> list[float]:
+    return [float(v) for v in torch.as_tensor(values).flatten()]

@@ -1,0 +1,219 @@
+"""The shield: what stands between any base policy and a robot. History, units, timing and faults live here.
+
+The policy wrapper and every other adapter share this one core. Its rule: nothing that is not finite, fresh, in time
+and in range ever counts as safe.
+"""
+
+import logging
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from lerobot_latentsafe.filter import FilterDecision, Reason, least_restrictive
+from lerobot_latentsafe.world_models.base import Latent, map_latent
+
+if TYPE_CHECKING:
+    from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+
+logger = logging.getLogger(__name__)
+
+RANGE_TOLERANCE = 1e-3
+"""Share of the action range by which float error may exceed it."""
+
+
+class Shield:
+    """Filters one action a tick for a batch of robots, remembering what they saw and did.
+
+    Args:
+        filter: a trained LatentSafePolicy: world model, margin, critic and their configuration.
+        clock: seconds, monotonic; replaceable in tests.
+    """
+
+    def __init__(self, filter: "LatentSafePolicy", clock: Callable[[], float] = time.perf_counter):
+        self.filter, self.clock = filter, clock
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the history: call at the start of every episode."""
+        self.latent: Latent | None = None
+        self.executed: Tensor | None = None
+        self.decision: FilterDecision | None = None
+
+    @torch.no_grad()
+    def __call__(
+        self, observation: dict[str, Tensor], proposed: Tensor | None, age_s: float = 0.0
+    ) -> FilterDecision:
+        """Decide on one proposed action.
+
+        Args:
+            observation: LeRobot batch: images (B, C, H, W) in [0, 1], observation.state (B, S) in robot units.
+            proposed: (B, A) in robot units, or None if there is none (the base policy failed).
+            age_s: how old the observation is, seconds; older than one period of the filter's fps is stale.
+
+        Returns:
+            The decision, also kept as `self.decision`.
+        """
+        started = self.clock()
+        model, config = self.filter, self.filter.config
+        images, state, fault = self._check_observation(observation, age_s)
+        fault, proposed, inputs = self._check_action(proposed, fault, len(state))
+        latent = self._filter_history(images, state, fault)
+        features = model.world_model.features(latent)
+        margin = model.margin.bounded(features)
+        fallback = self._fallback(features)
+        predicted = model.world_model.step(latent, inputs)
+        next_features = model.world_model.features(predicted)
+        value = model.critic.value(next_features, model.margin.bounded(next_features))
+        # A margin that is negative now is a failure whatever comes after.
+        value = torch.minimum(value, margin)
+        if config.deadline_ms is not None and (self.clock() - started) * 1e3 > config.deadline_ms:
+            fault = _first_fault(fault, torch.ones_like(fault, dtype=torch.bool), Reason.DEADLINE_MISSED)
+        decision = least_restrictive(
+            proposed, fallback, value, margin, config.epsilon, fault, monitor=config.mode == "monitor"
+        )
+        self.latent, self.decision = latent, decision
+        self.executed = model.normalise_action(decision.action).nan_to_num(0.0).clamp(-1, 1)
+        return decision
+
+    def _check_observation(
+        self, observation: dict[str, Tensor], age_s: float
+    ) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+        """Model inputs and the first fault of each row; faulty rows hold zeros."""
+        model, config = self.filter, self.filter.config
+        missing = [k for k in (*model.world_model.image_keys, "observation.state") if k not in observation]
+        if missing:
+            raise KeyError(
+                f"observation lacks {', '.join(missing)}; this filter was trained on "
+                f"{', '.join(model.world_model.image_keys)} and observation.state. Got "
+                f"{', '.join(k for k in observation if k.startswith('observation'))}. Rename the camera or state "
+                "(--rename_map), or train a filter for this robot"
+            )
+        state = model.normalise_state(observation["observation.state"].to(model.device))
+        fault = torch.zeros(len(state), dtype=torch.long, device=model.device)
+        images = {}
+        finite = torch.isfinite(state).all(-1)
+        for key in model.world_model.image_keys:
+            image = observation[key].to(model.device)
+            finite &= torch.isfinite(image).flatten(1).all(1)
+            in_range = (image >= -1e-3).flatten(1).all(1) & (image <= 1 + 1e-3).flatten(1).all(1)
+            finite &= in_range
+            images[key] = model.model_images(image.nan_to_num(0.0).clamp(0, 1))
+            # A camera that delivers one flat colour is covered or dead.
+            flat = (image.flatten(1).amax(1) - image.flatten(1).amin(1)) < 1e-3
+            fault = _first_fault(fault, flat, Reason.OBSERVATION_MISSING)
+        fault = _first_fault(fault, ~finite, Reason.OBSERVATION_NOT_FINITE)
+        if age_s > 1.0 / config.fps or not age_s >= 0:
+            fault = _first_fault(fault, torch.ones_like(finite), Reason.OBSERVATION_STALE)
+        return images, state.nan_to_num(0.0), fault
+
+    def _check_action(
+        self, proposed: Tensor | None, fault: Tensor, batch_size: int
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Faults, the proposal in robot units, and model inputs in [-1, 1]."""
+        model = self.filter
+        everyone = torch.ones(batch_size, dtype=torch.bool, device=model.device)
+        if proposed is None:
+            fault = _first_fault(fault, everyone, Reason.BASE_POLICY_FAILED)
+            proposed = model.hold_action(batch_size)
+        proposed = proposed.to(model.device, torch.float32)
+        expected = (batch_size, len(model.config.action_low))
+        if tuple(proposed.shape) != expected:
+            raise ValueError(
+                f"proposed action has shape {tuple(proposed.shape)}, expected {expected}: "
+                f"{', '.join(model.config.action_names or [])}. The base policy must be of the filter's action space"
+            )
+        finite = torch.isfinite(proposed).all(-1)
+        inputs = model.normalise_action(proposed).nan_to_num(0.0)
+        fault = _first_fault(fault, ~finite, Reason.ACTION_NOT_FINITE)
+        out_of_range = (inputs.abs() > 1 + 2 * RANGE_TOLERANCE).any(-1)
+        fault = _first_fault(fault, out_of_range, Reason.ACTION_OUT_OF_RANGE)
+        return fault, proposed, inputs.clamp(-1, 1)
+
+    def _filter_history(self, images: dict[str, Tensor], state: Tensor, fault: Tensor) -> Latent:
+        """Posterior of the world model; rows whose observation is unusable go on by imagination alone."""
+        world_model = self.filter.world_model
+        if self.latent is not None and len(self.latent["h" if "h" in self.latent else next(iter(self.latent))]) != len(
+            state
+        ):
+            raise ValueError("the batch changed size within an episode; call reset() between episodes")
+        start = self.latent is None
+        latent = world_model.initial(len(state)) if start else self.latent
+        executed = self.executed if not start else torch.zeros(
+            len(state), world_model.action_dim, device=state.device
+        )  # fmt: skip
+        predicted = world_model.step(latent, executed)
+        seen = world_model.correct(predicted, images, state)
+        blind = (fault >= Reason.OBSERVATION_NOT_FINITE) & (fault <= Reason.OBSERVATION_STALE)
+        return map_latent(
+            seen, lambda new, old: torch.where(blind.reshape(-1, *[1] * (new.ndim - 1)), old, new), predicted
+        )
+
+    def _fallback(self, features: Tensor) -> Tensor:
+        """The safety policy's action in robot units; where even that is not finite, hold."""
+        model = self.filter
+        action = model.denormalise_action(model.critic.fallback(features))
+        usable = torch.isfinite(action).all(-1) & torch.isfinite(features).all(-1)
+        return torch.where(usable[:, None], action, model.hold_action(len(features)))
+
+
+def _first_fault(fault: Tensor, where: Tensor, reason: Reason) -> Tensor:
+    """Set a reason on rows that have none yet."""
+    return torch.where((fault == Reason.PASSED) & where, torch.full_like(fault, reason), fault)
+
+
+class BasePolicy:
+    """Any LeRobot policy with its own processors, as the thing to be shielded.
+
+    Args:
+        path: folder, Hub id or the name of a committed checkpoint.
+        device: where it runs.
+    """
+
+    def __init__(self, path: str | Path, device: str):
+        from lerobot.configs.policies import PreTrainedConfig
+        from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+
+        from lerobot_latentsafe.checkpoint import resolve_checkpoint
+
+        self.path = resolve_checkpoint(path)
+        config = PreTrainedConfig.from_pretrained(self.path)
+        if config.type == "latentsafe":
+            raise ValueError(
+                f"base policy {path} is itself a latentsafe filter; shields do not nest. "
+                "Give --base_policy_path the policy to be shielded"
+            )
+        config.device = device
+        self.config = config
+        self.policy = get_policy_class(config.type).from_pretrained(self.path, config=config)
+        self.preprocessor, self.postprocessor = make_pre_post_processors(
+            config, pretrained_path=self.path, preprocessor_overrides={"device_processor": {"device": device}}
+        )
+
+    def reset(self) -> None:
+        self.policy.reset()
+        self.preprocessor.reset()
+        self.postprocessor.reset()
+
+    def propose(self, observation: dict[str, Tensor]) -> Tensor:
+        """Action (B, A) in robot units, through the base policy's own processors."""
+        return self.postprocessor(self.policy.select_action(self.preprocessor(dict(observation))))
+
+    def replan(self) -> None:
+        """Drop the rest of a planned chunk: after an intervention it belongs to a state that never came."""
+        queues = getattr(self.policy, "_queues", None)
+        if isinstance(queues, dict) and "action" in queues:
+            queues["action"].clear()
+        elif hasattr(self.policy, "_action_queue"):
+            self.policy._action_queue.clear()
+        else:
+            self.policy.reset()
+
+    def save(self, folder: Path) -> None:
+        """Write weights, config and processors to a folder."""
+        self.policy.save_pretrained(folder)
+        self.preprocessor.save_pretrained(folder)
+        self.postprocessor.save_pretrained(folder)

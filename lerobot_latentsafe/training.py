@@ -1,0 +1,104 @@
+"""Training of the second stage: reachability in a frozen world model's imagination."""
+
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from lerobot_latentsafe.datasets.clips import ClipReader
+from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+from lerobot_latentsafe.reachability import LatentImagination, LatentReachability, SafetyCritic, Starts
+from lerobot_latentsafe.world_models.base import Latent, map_latent, select
+
+
+@torch.no_grad()
+def encoded_starts(
+    policy: LatentSafePolicy, reader: ClipReader, generator: torch.Generator, max_frames: int = 100_000
+) -> Starts:
+    """Where imagination starts: encodings of random dataset windows, half of a single frame, half of a history.
+
+    Args:
+        generator: draws both the windows and the starts.
+        max_frames: frames encoded at most.
+
+    Returns:
+        A sampler of latents.
+    """
+    if reader.cache is None:
+        raise ValueError(
+            "reachability starts from encoded frames: run latentsafe cache on the dataset and give its folder "
+            "as --dataset.root"
+        )
+    n, length = len(reader.labels.failure), policy.config.world_model.clip_length
+    offset = int(torch.randint(length, (1,), generator=generator))
+    first = np.arange(offset, n, length)
+    first = first[torch.randperm(len(first), generator=generator)[: max_frames // length].numpy()]
+    single, filtered = [], []
+    for chunk in np.array_split(first, max(1, len(first) // 64)):
+        clip = reader.cut(chunk, policy)
+        kept = clip.valid.flatten()
+        z = policy.world_model.encode(clip)
+        filtered.append(select({k: v.flatten(0, 1) for k, v in z.items()}, kept))
+        images = {k: v.flatten(0, 1)[kept] for k, v in clip.images.items()}
+        single.append(policy.world_model.observe(None, None, images, clip.state.flatten(0, 1)[kept]))
+    pool: Latent = {k: torch.cat([z[k] for z in (*single, *filtered)]) for k in single[0]}
+    size = len(next(iter(pool.values())))
+
+    def draw(count: int) -> Latent:
+        picked = torch.randint(size, (count,), generator=generator).to(policy.device)
+        return map_latent(pool, lambda t: t[picked])
+
+    return draw
+
+
+def train_reachability(
+    path: str | Path, dataset_meta, output_dir: Path, seed: int = 0, steps: int | None = None
+) -> LatentSafePolicy:
+    """Load a stage-1 checkpoint, learn its safety critic, save the filter.
+
+    Raises:
+        UntrainedFilterError: the world model was never trained.
+        FileExistsError: output_dir holds a checkpoint already.
+    """
+    from tqdm import trange
+
+    if (Path(output_dir) / "config.json").exists():
+        raise FileExistsError(f"{output_dir} holds a checkpoint already; choose another --output_dir")
+    torch.manual_seed(seed)
+    policy = LatentSafePolicy.from_pretrained(path)
+    policy.require_stage("world_model")
+    policy.config.frame_cache = None  # that of the first stage may be gone; the dataset brings its own
+    reader = ClipReader.of_dataset(policy.config, dataset_meta)
+    config = policy.config.reachability
+    if steps is not None:
+        config.steps = steps
+    generator = torch.Generator(device="cpu").manual_seed(seed)
+    imagination = LatentImagination(policy.world_model, policy.margin)
+    candidates = policy.critic.candidates
+    critic = SafetyCritic(policy.world_model.feature_dim, policy.world_model.action_dim, candidates, config)
+    policy.critic = critic.to(policy.device)
+    started = time.process_time()
+    learner = LatentReachability(
+        imagination, policy.critic, encoded_starts(policy, reader, generator), config
+    )
+    progress = trange(config.steps, desc="reachability", unit="step")
+    for step in progress:
+        metrics = learner.update()
+        if step % 200 == 0:
+            progress.set_postfix(loss=f"{metrics['critic_loss']:.1e}", gamma=f"{metrics['gamma']:.4f}")
+    policy.config.stage = "reachability"
+    policy.critic.eval()
+    policy.config.frame_cache = None
+    save_filter(policy, output_dir)
+    print(f"reachability: {time.process_time() - started:.0f} CPU-s")
+    return policy
+
+
+def save_filter(policy: LatentSafePolicy, output_dir: Path) -> None:
+    """Write a filter with the processors LeRobot's commands expect beside it."""
+    from lerobot_latentsafe.processor_latentsafe import make_latentsafe_pre_post_processors
+
+    policy.save_pretrained(output_dir)
+    for pipeline in make_latentsafe_pre_post_processors(policy.config):
+        pipeline.save_pretrained(output_dir)

@@ -1,0 +1,306 @@
+"""Recurrent state-space model with a Gaussian latent (Hafner et al., 2019), the paper's model in simulation.
+
+z_t = (h_t, x_t): h_t = GRU(h_{t-1}, x_{t-1}, a_{t-1}) is deterministic, x_t is Gaussian with a prior p(x_t | h_t)
+and a posterior q(x_t | h_t, o_t). Training reconstructs images and proprioception and pulls prior and posterior
+together. Imagination and filtering carry means, so they are deterministic.
+"""
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from lerobot_latentsafe.world_models.base import Clip, Latent, WorldModel, WorldModelConfig
+
+
+@WorldModelConfig.register_subclass("rssm")
+@dataclass
+class RSSMConfig(WorldModelConfig):
+    """The default is the compact preset for two cores; `configs/dubins_rssm_paper.yaml` holds the paper's sizes.
+
+    Attributes:
+        deterministic, stochastic, hidden: sizes of h, x and of the layers between them.
+        encoder: `mlp` reads small images flat; `cnn` is DreamerV3's strided network down to 4 x 4.
+        cnn_depth: channels of the first of the CNN's layers, doubled at each.
+        units, image_layers: width and depth of the MLP image encoder and decoder.
+        state_units, state_layers: the same for proprioception.
+        min_std: lower bound of the latent's standard deviation.
+        free_nats, dynamics_scale, representation_scale: KL balancing as in DreamerV3.
+        image_scale: weight of the squared image error, summed over pixels. 16 makes a 32 x 32 image weigh
+            what the same picture weighs at 128 x 128.
+    """
+
+    image_size: int = 32
+    clip_length: int = 16
+    deterministic: int = 256
+    stochastic: int = 32
+    hidden: int = 256
+    encoder: str = "mlp"
+    cnn_depth: int = 32
+    units: int = 256
+    image_layers: int = 2
+    state_units: int = 64
+    state_layers: int = 2
+    min_std: float = 0.1
+    free_nats: float = 1.0
+    dynamics_scale: float = 0.5
+    representation_scale: float = 0.1
+    image_scale: float = 16.0
+
+    def build(self, image_keys: list[str], state_dim: int, action_dim: int) -> "RSSM":
+        return RSSM(self, image_keys, state_dim, action_dim)
+
+
+class _ChannelNorm(nn.LayerNorm):
+    """Layer norm over channels; in channels-last memory the permutation is a view."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return super().forward(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+
+
+def _mlp(n_in: int, units: int, n_layers: int) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for i in range(n_layers):
+        layers += [nn.Linear(n_in if i == 0 else units, units, bias=False), nn.LayerNorm(units), nn.SiLU()]
+    return nn.Sequential(*layers)
+
+
+def _cnn_channels(config: RSSMConfig) -> list[int]:
+    """Channels of the strided layers from the image's side down to 4."""
+    n_layers = (config.image_size // 4).bit_length() - 1
+    if config.image_size != 4 * 2**n_layers:
+        raise ValueError(f"image_size is {config.image_size}; the cnn encoder needs 4 times a power of two")
+    return [config.cnn_depth * 2**i for i in range(n_layers)]
+
+
+class _ImageEncoder(nn.Module):
+    """(N, 3, S, S) -> (N, dim)."""
+
+    def __init__(self, config: RSSMConfig):
+        super().__init__()
+        if config.encoder == "mlp":
+            self.dim = config.units
+            pixels = 3 * config.image_size**2
+            self.net = nn.Sequential(nn.Flatten(), _mlp(pixels, config.units, config.image_layers))
+            return
+        channels = _cnn_channels(config)
+        layers: list[nn.Module] = []
+        for n_in, n_out in zip([3, *channels], channels):
+            layers += [nn.Conv2d(n_in, n_out, 4, 2, 1, bias=False), _ChannelNorm(n_out, eps=1e-3), nn.SiLU()]
+        self.dim = channels[-1] * 16
+        self.net = nn.Sequential(*layers, nn.Flatten())
+
+    def forward(self, images: Tensor) -> Tensor:
+        return self.net(images.contiguous(memory_format=torch.channels_last))
+
+
+class _ImageDecoder(nn.Module):
+    """(N, D) -> (N, 3, S, S)."""
+
+    def __init__(self, config: RSSMConfig, feature_dim: int):
+        super().__init__()
+        self.size = config.image_size
+        self.flat = config.encoder == "mlp"
+        if self.flat:
+            last = nn.Linear(config.units, 3 * config.image_size**2)
+            self.net = nn.Sequential(_mlp(feature_dim, config.units, config.image_layers), last)
+        else:
+            channels = _cnn_channels(config)[::-1]
+            self.channels = channels[0]
+            self.project = nn.Linear(feature_dim, channels[0] * 16)
+            layers: list[nn.Module] = []
+            for n_in, n_out in zip(channels[:-1], channels[1:]):
+                layers += [nn.ConvTranspose2d(n_in, n_out, 4, 2, 1, bias=False), _ChannelNorm(n_out, eps=1e-3)]
+                layers.append(nn.SiLU())
+            last = nn.ConvTranspose2d(channels[-1], 3, 4, 2, 1)
+            self.net = nn.Sequential(*layers, last)
+        # Start near the mean image: the first gradients then go to what moves.
+        nn.init.zeros_(last.bias)
+        with torch.no_grad():
+            last.weight.mul_(0.1)
+
+    def forward(self, features: Tensor) -> Tensor:
+        if self.flat:
+            return self.net(features).unflatten(1, (3, self.size, self.size))
+        x = self.project(features).unflatten(1, (self.channels, 4, 4))
+        return self.net(x.contiguous(memory_format=torch.channels_last))
+
+
+class RSSM(WorldModel):
+    """See the module's text. Latent: h (B, H), mean and std of x (B, S), and the x (B, S) carried on."""
+
+    def __init__(self, config: RSSMConfig, image_keys: list[str], state_dim: int, action_dim: int):
+        super().__init__()
+        if not image_keys:
+            raise ValueError("an RSSM needs at least one camera, got none; record observation.image* features")
+        if config.encoder not in ("mlp", "cnn"):
+            raise ValueError(f"encoder is {config.encoder!r}; expected 'mlp' or 'cnn'")
+        self.config, self.image_keys, self.action_dim = config, sorted(image_keys), action_dim
+        h, x, hidden = config.deterministic, config.stochastic, config.hidden
+        self.feature_dim = h + x
+        # Module names must not hold dots, dataset keys do.
+        self.cameras = {key: key.replace(".", "_") for key in self.image_keys}
+        shape = (3, config.image_size, config.image_size)
+        self.encoders = nn.ModuleDict({name: _ImageEncoder(config) for name in self.cameras.values()})
+        self.decoders = nn.ModuleDict(
+            {name: _ImageDecoder(config, self.feature_dim) for name in self.cameras.values()}
+        )
+        for name in self.cameras.values():
+            self.register_buffer(f"mean_{name}", torch.zeros(shape))
+        self.register_buffer("mean_count", torch.zeros(()))
+        self.state_encoder = _mlp(state_dim, config.state_units, config.state_layers)
+        self.state_decoder = nn.Sequential(
+            _mlp(self.feature_dim, config.state_units, config.state_layers),
+            nn.Linear(config.state_units, state_dim),
+        )
+        embedding = sum(e.dim for e in self.encoders.values()) + config.state_units
+        self.embed_in = nn.Linear(embedding, hidden, bias=False)
+        self.recurrent_in = nn.Linear(x + action_dim, hidden, bias=False)
+        self.recurrent_norm = nn.LayerNorm(hidden, eps=1e-3)
+        self.gru = nn.Linear(hidden + h, 3 * h, bias=False)
+        self.gru_norm = nn.LayerNorm(3 * h, eps=1e-3)
+        self.prior_in, self.prior_norm = nn.Linear(h, hidden, bias=False), nn.LayerNorm(hidden, eps=1e-3)
+        self.prior_out = nn.Linear(hidden, 2 * x)
+        self.posterior_in, self.posterior_norm = (
+            nn.Linear(h, hidden, bias=False),
+            nn.LayerNorm(hidden, eps=1e-3),
+        )
+        self.posterior_out = nn.Linear(hidden, 2 * x)
+        self.register_buffer("ends_seen", torch.zeros(()))
+        self.h0 = nn.Parameter(torch.zeros(h))
+        self.continues = nn.Sequential(_mlp(self.feature_dim, config.state_units, 1), nn.Linear(config.state_units, 1))
+
+    # -- the model -----------------------------------------------------------------------------------------------
+
+    def initial(self, batch_size: int) -> Latent:
+        h = torch.tanh(self.h0).expand(batch_size, -1)
+        return self._with_prior(h)
+
+    def step(self, latent: Latent, action: Tensor) -> Latent:
+        return self._with_prior(self._recur(latent["h"], latent["x"], action))
+
+    def correct(self, predicted: Latent, images: dict[str, Tensor], state: Tensor) -> Latent:
+        mean, std = self._posterior(predicted["h"], self.embed(images, state))
+        return {"h": predicted["h"], "x": mean, "std": std}
+
+    def features(self, latent: Latent) -> Tensor:
+        return torch.cat([latent["x"], latent["h"]], -1)
+
+    def ended(self, latent: Latent) -> Tensor:
+        over = self.continues(self.features(latent)).squeeze(-1) < 0
+        return over & (self.ends_seen > 0)  # a head that never saw an end knows nothing
+
+    def embed(self, images: dict[str, Tensor], state: Tensor) -> Tensor:
+        """Observations (N, ...) -> (N, hidden)."""
+        parts = [self.encoders[name](self._centred(key, images)) for key, name in self.cameras.items()]
+        return self.embed_in(torch.cat([*parts, self.state_encoder(state)], -1))
+
+    def decode(self, features: Tensor) -> dict[str, Tensor]:
+        """Features (N, D) -> camera key -> images (N, 3, S, S), about in [0, 1]."""
+        return {
+            key: self.decoders[name](features) + getattr(self, f"mean_{name}")
+            for key, name in self.cameras.items()
+        }
+
+    def _recur(self, h: Tensor, x: Tensor, action: Tensor) -> Tensor:
+        u = F.silu(self.recurrent_norm(self.recurrent_in(torch.cat([x, action], -1))))
+        reset, candidate, update = self.gru_norm(self.gru(torch.cat([u, h], -1))).chunk(3, -1)
+        # The bias of -1 makes a fresh cell remember, as in DreamerV3.
+        return torch.lerp(h, torch.tanh(torch.sigmoid(reset) * candidate), torch.sigmoid(update - 1))
+
+    def _gaussian(self, raw: Tensor) -> tuple[Tensor, Tensor]:
+        mean, std = raw.chunk(2, -1)
+        return mean, 2 * torch.sigmoid(std / 2) + self.config.min_std
+
+    def _prior(self, h: Tensor) -> tuple[Tensor, Tensor]:
+        return self._gaussian(self.prior_out(F.silu(self.prior_norm(self.prior_in(h)))))
+
+    def _posterior(self, h: Tensor, embedding: Tensor) -> tuple[Tensor, Tensor]:
+        return self._gaussian(self.posterior_out(F.silu(self.posterior_norm(self.posterior_in(h) + embedding))))
+
+    def _with_prior(self, h: Tensor) -> Latent:
+        mean, std = self._prior(h)
+        return {"h": h, "x": mean, "std": std}
+
+    def _centred(self, key: str, images: dict[str, Tensor]) -> Tensor:
+        return images[key] - getattr(self, f"mean_{self.cameras[key]}")
+
+    # -- learning ------------------------------------------------------------------------------------------------
+
+    def loss(self, clip: Clip) -> tuple[Tensor, Tensor, dict[str, float]]:
+        """Reconstruction + balanced KL + continuation; samples x so that the model is trained as a distribution."""
+        if self.training:
+            self._update_mean_image(clip)
+        batch, length = clip.state.shape[:2]
+        images = {key: value.flatten(0, 1) for key, value in clip.images.items()}
+        embedding = self.embed(images, clip.state.flatten(0, 1)).unflatten(0, (batch, length))
+        h, x, mean, std = self._filter_sampled(embedding, clip)
+        features = torch.cat([x, h], -1)
+        weight = clip.valid.float()
+        weight = weight / weight.sum().clamp(min=1)
+
+        kl_dynamics, kl_representation, kl = self._balanced_kl(h, mean, std, weight)
+        error = {}
+        for key, name in self.cameras.items():
+            residual = self.decoders[name](features.flatten(0, 1)) - self._centred(key, images)
+            per_frame = residual.square().flatten(1).sum(1).unflatten(0, (batch, length))
+            error[f"loss_{name}"] = (per_frame * weight).sum()
+        state_error = (self.state_decoder(features) - clip.state).square().sum(-1)
+        error_state = (state_error * weight).sum()
+        loss = (
+            self.config.image_scale * sum(error.values())
+            + error_state
+            + self.config.dynamics_scale * kl_dynamics
+            + self.config.representation_scale * kl_representation
+            + self._continue_loss(features, clip)
+        )
+        metrics = {key: value.item() for key, value in error.items()}
+        return loss, features, {**metrics, "loss_state": error_state.item(), "kl": kl.item()}
+
+    def _filter_sampled(self, embedding: Tensor, clip: Clip) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        batch, length = embedding.shape[:2]
+        start = self.initial(batch)
+        h, x = start["h"], start["x"]
+        rows = []
+        for t in range(length):
+            first = clip.is_first[:, t, None]
+            h, x = torch.where(first, start["h"], h), torch.where(first, start["x"], x)
+            h = self._recur(h, x, clip.action[:, t])
+            mean, std = self._posterior(h, embedding[:, t])
+            x = mean + std * torch.randn_like(std)
+            rows.append((h, x, mean, std))
+        h, x, mean, std = (torch.stack(column, 1) for column in zip(*rows))
+        return h, x, mean, std
+
+    def _balanced_kl(self, h: Tensor, mean: Tensor, std: Tensor, weight: Tensor) -> tuple[Tensor, ...]:
+        prior_mean, prior_std = self._prior(h)
+        free = self.config.free_nats
+        dynamics = _gaussian_kl(mean.detach(), std.detach(), prior_mean, prior_std)
+        representation = _gaussian_kl(mean, std, prior_mean.detach(), prior_std.detach())
+        mean_of = lambda kl: (kl * weight).sum()  # noqa: E731
+        return mean_of(dynamics.clamp(min=free)), mean_of(representation.clamp(min=free)), mean_of(dynamics).detach()
+
+    def _continue_loss(self, features: Tensor, clip: Clip) -> Tensor:
+        known = (clip.terminal >= 0) & clip.valid
+        if not known.any():
+            return features.sum() * 0.0
+        if self.training:
+            self.ends_seen += (clip.terminal[known] == 1).any()
+        logits = self.continues(features.detach()).squeeze(-1)[known]
+        return F.binary_cross_entropy_with_logits(logits, (clip.terminal[known] == 0).float())
+
+    @torch.no_grad()
+    def _update_mean_image(self, clip: Clip, settle_after: int = 200) -> None:
+        """Running mean image of the first batches, which the encoder subtracts and the decoder adds."""
+        if self.mean_count >= settle_after:
+            return
+        self.mean_count += 1
+        for key, name in self.cameras.items():
+            mean = getattr(self, f"mean_{name}")
+            mean.lerp_(clip.images[key].mean((0, 1)), float(1 / self.mean_count))
+
+
+def _gaussian_kl(mean1: Tensor, std1: Tensor, mean2: Tensor, std2: Tensor) -> Tensor:
+    """KL(N1 || N2) of diagonal Gaussians, summed over the last axis."""
+    return (torch.log(std2 / std1) + (std1**2 + (mean1 - mean2) ** 2) / (2 * std2**2) - 0.5).sum(-1)
