@@ -5,19 +5,20 @@ import logging
 import sys
 
 VERBS: dict[str, tuple[str, str]] = {
-    "collect": ("lerobot_latentsafe.commands:Collect", "record labelled episodes of a simulated task as a LeRobotDataset"),
-    "cache": ("lerobot_latentsafe.commands:Cache", "decode a dataset's frames once, so that training does not have to"),
+    "collect": ("Collect", "record labelled episodes of a simulated task as a LeRobotDataset"),
+    "cache": ("Cache", "decode a dataset's frames once, so that training does not have to"),
     "train-reachability": (
-        "lerobot_latentsafe.commands:TrainReachability",
-        "learn the safety value and the fallback in a trained world model's imagination",
+        "TrainReachability",
+        "learn the safety value and the fallback in a world model's imagination",
     ),
-    "calibrate": ("lerobot_latentsafe.commands:Calibrate", "choose epsilon on held-out episodes and store the evidence"),
-    "wrap": ("lerobot_latentsafe.commands:Wrap", "write a filter and the policy it shields as one self-contained folder"),
-    "push": ("lerobot_latentsafe.commands:Push", "push a filter, or a shielded policy, to the Hub with its card"),
-    "eval-monitor": ("lerobot_latentsafe.commands:EvalMonitor", "compare a filter's verdicts with the exact safe set (Table 1)"),
-    "eval-shield": ("lerobot_latentsafe.commands:EvalShield", "run a policy bare and shielded from the same starts"),
-    "path": ("lerobot_latentsafe.commands:PathOf", "print the folder of a committed checkpoint, for LeRobot's commands"),
-}  # fmt: skip
+    "calibrate": ("Calibrate", "choose epsilon on held-out episodes and store the evidence"),
+    "wrap": ("Wrap", "write a filter and the policy it shields as one self-contained folder"),
+    "push": ("Push", "push a filter, or a shielded policy, to the Hub with its card"),
+    "eval-monitor": ("EvalMonitor", "compare a filter's verdicts with the exact safe set (Table 1)"),
+    "eval-shield": ("EvalShield", "run a policy bare and shielded from the same starts"),
+    "path": ("PathOf", "print the folder of a committed checkpoint, for LeRobot's commands"),
+}
+"""Verb -> its dataclass in `commands.py`, and what it is for."""
 
 INTRODUCTION = """Latent safety filters for LeRobot.
 
@@ -46,8 +47,7 @@ def main(argv: list[str] | None = None) -> None:
         sys.exit(f"latentsafe: unknown verb {verb!r}; expected one of {', '.join(VERBS)}")
     # torchcodec without system FFmpeg logs a page of traceback; LeRobot then falls back to pyav by itself.
     logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
-    module, name = VERBS[verb][0].split(":")
-    command = getattr(importlib.import_module(module), name)
+    command = getattr(importlib.import_module("lerobot_latentsafe.commands"), VERBS[verb][0])
 
     import draccus
     from lerobot.utils.import_utils import register_third_party_plugins
@@ -57,9 +57,6 @@ def main(argv: list[str] | None = None) -> None:
     try:
         draccus.parse(command, args=options).run()
     except (ValueError, OSError, RuntimeError, ImportError, KeyError) as e:
-        # A user's mistake gets its message; a bug of ours can be traced with --traceback through LATENTSAFE_DEBUG.
-        if logging.getLogger().isEnabledFor(logging.DEBUG):
-            raise
         sys.exit(f"latentsafe {verb}: {e.args[0] if isinstance(e, KeyError) else e}")
 
 

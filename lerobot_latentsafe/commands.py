@@ -94,6 +94,195 @@ class TrainReachability:
 
 
 @dataclass
+class Calibrate:
+    """Choose the smallest epsilon that warns in time on held-out failing episodes, and store the evidence.
+
+    Give episodes the filter was not trained on; the filter with its new epsilon is written to --output_dir.
+    """
+
+    policy: PolicySource
+    output_dir: Path
+    dataset: DatasetSource = field(default_factory=DatasetSource)
+    n_episodes: int = 200
+    """Episodes used at most, the last ones of the dataset."""
+    max_missed: float = 0.05
+    """Share of failing episodes that may be warned about too late."""
+    lead_steps: int = 3
+    """Frames of warning asked for before the failure."""
+
+    def run(self) -> None:
+        import numpy as np
+
+        from lerobot_latentsafe.calibration import calibrate, episode_values, store
+        from lerobot_latentsafe.datasets.clips import ClipReader
+        from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+        from lerobot_latentsafe.training import save_filter
+
+        policy = LatentSafePolicy.from_pretrained(self.policy.path)
+        reader = ClipReader.of_dataset(policy.config, self.dataset.metadata())
+        episodes = np.unique(reader.labels.episode)[-self.n_episodes :]
+        found = calibrate(episode_values(policy, reader, episodes), self.max_missed, self.lead_steps)
+        store(policy, found)
+        policy.config.frame_cache = None
+        save_filter(policy, self.output_dir)
+        for name, value in dataclasses.asdict(found).items():
+            print(f"{name:18s} {value:g}")
+
+
+@dataclass
+class Wrap:
+    """Write a filter and the policy it shields as one self-contained folder that every LeRobot command can load."""
+
+    policy: PolicySource
+    output_dir: Path
+    base_policy_path: str | None = None
+    epsilon: float | None = None
+    mode: str | None = None
+    half: bool = False
+    """Store weights in 16 bits."""
+
+    def run(self) -> None:
+        from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+        from lerobot_latentsafe.training import save_filter
+
+        policy = LatentSafePolicy.from_pretrained(self.policy.path)
+        if self.epsilon is not None:
+            policy.config.epsilon = self.epsilon
+        if self.mode is not None:
+            policy.config.mode = self.mode
+        policy.config.__post_init__()
+        if self.base_policy_path:
+            policy.attach(self.base_policy_path)
+        save_filter(policy, self.output_dir, half=self.half)
+        print(f"wrote {self.output_dir}")
+
+
+@dataclass
+class Push:
+    """Push a filter, or a shielded policy, to the Hub with its card."""
+
+    policy: PolicySource
+    repo_id: str
+    dataset_repo_id: str = "unknown"
+    """The dataset named in the card."""
+    base_policy_path: str | None = None
+    private: bool = False
+
+    def run(self) -> None:
+        from lerobot_latentsafe.hub import push_filter
+        from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+
+        policy = LatentSafePolicy.from_pretrained(self.policy.path)
+        if self.base_policy_path:
+            policy.attach(self.base_policy_path)
+        print(f"pushed to {push_filter(policy, self.repo_id, self.dataset_repo_id, self.private)}")
+
+
+@dataclass
+class EvalMonitor:
+    """Compare a filter's verdict V > 0 with the exact safe set, and drive its fallback policy from feasible starts.
+
+    Truths: discrete (the car's exact discrete-time value with three actions) or continuous (the paper's: hj_reachability
+    on its grid). Without --states the paper's grid of 51 x 51 x 53 states is scored.
+    """
+
+    env: EnvConfig
+    policy: PolicySource = field(default_factory=PolicySource)
+    truth: str = "discrete"
+    states: Path | None = None
+    """.npy file (N, 3): x, y, heading."""
+    values_out: Path | None = None
+    """Where to write V of these states, .npy (N,)."""
+    json: Path | None = None
+    figure: Path | None = None
+    """Where to draw value slices over the exact boundary, .png."""
+
+    def run(self) -> None:
+        import numpy as np
+
+        from lerobot_latentsafe.evaluation.ground_truth import load_states, truth_on
+        from lerobot_latentsafe.evaluation.monitor import LatentMonitor, evaluate_monitor
+        from lerobot_latentsafe.evaluation.rollouts import provenance, write_json
+        from lerobot_latentsafe.evaluation.shielding import check_environment
+        from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+
+        if self.env.type != "latentsafe_dubins":
+            raise ValueError(f"--env.type is {self.env.type!r}; an exact safe set is known for latentsafe_dubins only")
+        states, true_value = truth_on(load_states(self.states) if self.states else None, self.truth)
+        policy = LatentSafePolicy.from_pretrained(self.policy.path)
+        check_environment(policy, self.env)
+        monitor = LatentMonitor(policy)
+        row, value = evaluate_monitor(monitor, states, true_value)
+        row = {"truth": self.truth, **row, **provenance(seeds=[])}
+        for name, entry in row.items():
+            print(f"{name:20s} {entry:.4f}" if isinstance(entry, float) else f"{name:20s} {entry}")
+        if self.values_out:
+            np.save(self.values_out, value)
+        if self.json:
+            write_json(self.json, row)
+        if self.figure:
+            from lerobot_latentsafe.evaluation.figures import save, value_slices
+
+            save(value_slices({"latent": monitor}), self.figure)
+
+
+@dataclass
+class EvalShield:
+    """Run a policy bare and shielded from the same starts, and say what the filter changed."""
+
+    env: EnvConfig
+    policy: PolicySource = field(default_factory=PolicySource)
+    base_policy_path: str | None = None
+    n_episodes: int = 200
+    seed: int = 0
+    epsilon: float | None = None
+    """Overrides the filter's."""
+    json: Path | None = None
+    video: Path | None = None
+    """Folder for videos of the first episodes, bare and shielded side by side."""
+    n_videos: int = 5
+    figure: Path | None = None
+    """Where to draw the trajectories, .png."""
+
+    def run(self) -> None:
+        from lerobot_latentsafe.evaluation.rollouts import provenance, write_json
+        from lerobot_latentsafe.evaluation.shielding import compare
+        from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+
+        if self.n_episodes < 1:
+            raise ValueError(f"--n_episodes is {self.n_episodes}; expected at least 1")
+        policy = LatentSafePolicy.from_pretrained(self.policy.path)
+        if self.epsilon is not None:
+            policy.config.epsilon = self.epsilon
+        if self.base_policy_path:
+            policy.attach(self.base_policy_path)
+        result = compare(policy, self.env, self.n_episodes, self.seed, self.n_videos if self.video else 0)
+        episodes = result.pop("episodes")
+        row = {**result, "epsilon": policy.config.epsilon, **provenance(seeds=[self.seed])}
+        for name in ("bare", "shielded"):
+            rates = row[name]
+            print(
+                name.ljust(9),
+                *(f"{k} {v['k']}/{v['n']}" for k, v in rates.items() if isinstance(v, dict)),
+                sep="  ",
+            )
+        print(
+            f"overridden {row['shielded']['overridden_share']:.1%} of steps, violations p = {row['violation_p_value']:.2g}"
+        )
+        if self.json:
+            write_json(self.json, row)
+        if self.figure:
+            from lerobot_latentsafe.evaluation.figures import save, trajectories
+
+            save(trajectories(episodes), self.figure)
+        if self.video:
+            from lerobot_latentsafe.evaluation.figures import write_videos
+
+            for path in write_videos(episodes, self.video, self.env.fps):
+                print(path)
+
+
+@dataclass
 class PathOf:
     """Print the folder of a committed checkpoint."""
 

@@ -68,7 +68,7 @@ class LatentSafeConfig(PreTrainedConfig):
     optimizer_lr: float = 1e-3
     grad_clip_norm: float = 100.0
     scheduler_steps: int = 3000
-    drop_n_last_frames: int = 3
+    drop_n_last_frames: int = 1
 
     # Images stay in [0, 1]; state and actions are scaled by the model with the numbers it stores itself.
     normalization_mapping: dict[str, NormalizationMode] = field(

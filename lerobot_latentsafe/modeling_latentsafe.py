@@ -63,7 +63,7 @@ class LatentSafePolicy(PreTrainedPolicy):
         if config.base_policy_path:
             self.attach(config.base_policy_path)
 
-    # -- units ---------------------------------------------------------------------------------------------------
+    # -- units ---
 
     @property
     def device(self) -> torch.device:
@@ -87,7 +87,7 @@ class LatentSafePolicy(PreTrainedPolicy):
         """What to do when nothing can be known: zero motion, or the nearest the range allows."""
         return torch.zeros_like(self.action_low).clamp(self.action_low, self.action_high).repeat(batch_size, 1)
 
-    # -- training (stage 1) --------------------------------------------------------------------------------------
+    # -- training (stage 1) ---
 
     def get_optim_params(self) -> list:
         return [*self.world_model.parameters(), *self.margin.parameters()]
@@ -117,7 +117,7 @@ class LatentSafePolicy(PreTrainedPolicy):
         features = self.world_model.features(latent)
         return self.critic.value(features, self.margin.bounded(features))
 
-    # -- deployment ----------------------------------------------------------------------------------------------
+    # -- deployment ---
 
     @property
     def base(self) -> BasePolicy | None:
@@ -182,7 +182,7 @@ class LatentSafePolicy(PreTrainedPolicy):
                 f"trained. Run {command} first"
             )
 
-    # -- files ---------------------------------------------------------------------------------------------------
+    # -- files ---
 
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
         config, base_path = self.config, self.config.base_policy_path

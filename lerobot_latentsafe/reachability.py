@@ -10,6 +10,7 @@ import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Protocol
 
 import torch
@@ -17,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from lerobot_latentsafe.margin import FailureMargin
-from lerobot_latentsafe.world_models.base import Latent, WorldModel, map_latent, select
+from lerobot_latentsafe.world_models.base import Latent, WorldModel, map_latent, replace_rows, select
 
 Starts = Callable[[int], Latent]
 """Draws a batch of latents from which imagination starts: encoded dataset windows."""
@@ -98,7 +99,7 @@ class ReachabilityConfig:
 
 def _mlp(sizes: list[int], activation: str) -> nn.Sequential:
     layers: list[nn.Module] = []
-    for i, (n_in, n_out) in enumerate(zip(sizes[:-1], sizes[1:])):
+    for i, (n_in, n_out) in enumerate(pairwise(sizes)):
         layers.append(nn.Linear(n_in, n_out))
         if i < len(sizes) - 2:
             layers.append({"tanh": nn.Tanh, "relu": nn.ReLU}[activation]())
@@ -114,9 +115,7 @@ class SafetyCritic(nn.Module):
         candidates: (K, A) in [-1, 1], the discrete action set, or None for continuous actions.
     """
 
-    def __init__(
-        self, feature_dim: int, action_dim: int, candidates: Tensor | None, config: ReachabilityConfig
-    ):
+    def __init__(self, feature_dim: int, action_dim: int, candidates: Tensor | None, config: ReachabilityConfig):
         super().__init__()
         self.register_buffer("feature_mean", torch.zeros(feature_dim))
         self.register_buffer("feature_std", torch.ones(feature_dim))
@@ -125,9 +124,7 @@ class SafetyCritic(nn.Module):
         n_out = len(candidates) if self.discrete else 1
         n_in = feature_dim + (0 if self.discrete else action_dim)
         self.q = _mlp([n_in, *config.critic_hidden, n_out], config.activation)
-        self.actor = (
-            None if self.discrete else _mlp([feature_dim, *config.actor_hidden, action_dim], config.activation)
-        )
+        self.actor = None if self.discrete else _mlp([feature_dim, *config.actor_hidden, action_dim], config.activation)
 
     def set_feature_scale(self, features: Tensor) -> None:
         """Standardise by these features (N, D)."""
@@ -193,7 +190,7 @@ class LatentReachability:
         self.pool: dict[str, Tensor] = {}
         self._fill_pool()
 
-    # -- imagination ---------------------------------------------------------------------------------------------
+    # -- imagination ---
 
     @torch.no_grad()
     def imagine(self) -> dict[str, Tensor]:
@@ -229,9 +226,7 @@ class LatentReachability:
             taken = torch.arange(n, device=x.device) * k + choice
             latent = select(after, taken)
             if ended[taken].any():
-                latent = map_latent(
-                    latent, lambda old, new: torch.where(_like(ended[taken], old), new, old), self.starts(n)
-                )
+                latent = replace_rows(latent, self.starts(n), where=ended[taken])
         return {key: torch.cat([row[key] for row in rows]) for key in rows[0]}
 
     def _explore(self, x: Tensor, greedy: Tensor) -> tuple[Tensor, Tensor]:
@@ -266,7 +261,7 @@ class LatentReachability:
             self.pool[key][self._oldest : self._oldest + n] = value
         self._oldest = (self._oldest + n) % size
 
-    # -- learning ------------------------------------------------------------------------------------------------
+    # -- learning ---
 
     def update(self) -> dict[str, float]:
         """One gradient step; returns metrics."""
@@ -321,8 +316,3 @@ class LatentReachability:
         frozen = {name: p.detach() for name, p in self.critic.q.named_parameters()}
         inputs = torch.cat([x, self.critic.act(x)], -1)
         return torch.func.functional_call(self.critic.q, frozen, (inputs,)).mean()
-
-
-def _like(mask: Tensor, tensor: Tensor) -> Tensor:
-    """mask (B,) shaped to broadcast over tensor (B, ...)."""
-    return mask.reshape(-1, *[1] * (tensor.ndim - 1))

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from lerobot_latentsafe.filter import FilterDecision, Reason, least_restrictive
-from lerobot_latentsafe.world_models.base import Latent, map_latent
+from lerobot_latentsafe.world_models.base import Latent, replace_rows
 
 if TYPE_CHECKING:
     from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
@@ -44,9 +44,7 @@ class Shield:
         self.decision: FilterDecision | None = None
 
     @torch.no_grad()
-    def __call__(
-        self, observation: dict[str, Tensor], proposed: Tensor | None, age_s: float = 0.0
-    ) -> FilterDecision:
+    def __call__(self, observation: dict[str, Tensor], proposed: Tensor | None, age_s: float = 0.0) -> FilterDecision:
         """Decide on one proposed action.
 
         Args:
@@ -110,9 +108,7 @@ class Shield:
             fault = _first_fault(fault, torch.ones_like(finite), Reason.OBSERVATION_STALE)
         return images, state.nan_to_num(0.0), fault
 
-    def _check_action(
-        self, proposed: Tensor | None, fault: Tensor, batch_size: int
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def _check_action(self, proposed: Tensor | None, fault: Tensor, batch_size: int) -> tuple[Tensor, Tensor, Tensor]:
         """Faults, the proposal in robot units, and model inputs in [-1, 1]."""
         model = self.filter
         everyone = torch.ones(batch_size, dtype=torch.bool, device=model.device)
@@ -136,10 +132,11 @@ class Shield:
     def _filter_history(self, images: dict[str, Tensor], state: Tensor, fault: Tensor) -> Latent:
         """Posterior of the world model; rows whose observation is unusable go on by imagination alone."""
         world_model = self.filter.world_model
-        if self.latent is not None and len(self.latent["h" if "h" in self.latent else next(iter(self.latent))]) != len(
-            state
-        ):
-            raise ValueError("the batch changed size within an episode; call reset() between episodes")
+        if self.executed is not None and len(self.executed) != len(state):
+            raise ValueError(
+                f"the batch went from {len(self.executed)} to {len(state)} robots within an episode; "
+                "call reset() between episodes"
+            )
         start = self.latent is None
         latent = world_model.initial(len(state)) if start else self.latent
         executed = self.executed if not start else torch.zeros(
@@ -148,9 +145,7 @@ class Shield:
         predicted = world_model.step(latent, executed)
         seen = world_model.correct(predicted, images, state)
         blind = (fault >= Reason.OBSERVATION_NOT_FINITE) & (fault <= Reason.OBSERVATION_STALE)
-        return map_latent(
-            seen, lambda new, old: torch.where(blind.reshape(-1, *[1] * (new.ndim - 1)), old, new), predicted
-        )
+        return replace_rows(seen, predicted, where=blind)
 
     def _fallback(self, features: Tensor) -> Tensor:
         """The safety policy's action in robot units; where even that is not finite, hold."""

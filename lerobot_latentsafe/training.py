@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from lerobot_latentsafe.checkpoint import WEIGHTS, seal
 from lerobot_latentsafe.datasets.clips import ClipReader
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.reachability import LatentImagination, LatentReachability, SafetyCritic, Starts
@@ -79,9 +80,7 @@ def train_reachability(
     critic = SafetyCritic(policy.world_model.feature_dim, policy.world_model.action_dim, candidates, config)
     policy.critic = critic.to(policy.device)
     started = time.process_time()
-    learner = LatentReachability(
-        imagination, policy.critic, encoded_starts(policy, reader, generator), config
-    )
+    learner = LatentReachability(imagination, policy.critic, encoded_starts(policy, reader, generator), config)
     progress = trange(config.steps, desc="reachability", unit="step")
     for step in progress:
         metrics = learner.update()
@@ -95,10 +94,22 @@ def train_reachability(
     return policy
 
 
-def save_filter(policy: LatentSafePolicy, output_dir: Path) -> None:
-    """Write a filter with the processors LeRobot's commands expect beside it."""
+def save_filter(policy: LatentSafePolicy, output_dir: Path, half: bool = False) -> None:
+    """Write a filter with the processors LeRobot's commands expect beside it; `half` stores 16-bit weights."""
     from lerobot_latentsafe.processor_latentsafe import make_latentsafe_pre_post_processors
 
     policy.save_pretrained(output_dir)
+    if half:
+        halve_weights(output_dir)
     for pipeline in make_latentsafe_pre_post_processors(policy.config):
         pipeline.save_pretrained(output_dir)
+
+
+def halve_weights(folder: Path) -> None:
+    """Rewrite every model.safetensors below a folder in 16 bits, and seal the filter's again."""
+    from safetensors.torch import load_file, save_file
+
+    for file in Path(folder).rglob(WEIGHTS):
+        tensors = {k: v.half() if v.is_floating_point() else v for k, v in load_file(file).items()}
+        save_file(tensors, file, metadata={"format": "pt"})
+    seal(Path(folder))

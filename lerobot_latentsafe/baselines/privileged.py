@@ -40,18 +40,14 @@ class DubinsImagination:
         return latent["state"][..., :2].abs().amax(-1) > self.half_width
 
 
-def train_privileged(
-    config: ReachabilityConfig, seed: int, on_step=None
-) -> tuple[DubinsImagination, SafetyCritic]:
+def train_privileged(config: ReachabilityConfig, seed: int, on_step=None) -> tuple[DubinsImagination, SafetyCritic]:
     """Learn the safety value on true states (x, y, heading), uniform starts in the view."""
     torch.manual_seed(seed)
     imagination = DubinsImagination()
     scale = torch.tensor([dubins.VIEW, dubins.VIEW, math.pi])
     candidates = torch.tensor([[-1.0], [0.0], [1.0]])
     critic = SafetyCritic(4, 1, candidates, config)
-    learner = LatentReachability(
-        imagination, critic, lambda n: {"state": (2 * torch.rand(n, 3) - 1) * scale}, config
-    )
+    learner = LatentReachability(imagination, critic, lambda n: {"state": (2 * torch.rand(n, 3) - 1) * scale}, config)
     for _ in range(config.steps):
         metrics = learner.update()
         if on_step is not None:

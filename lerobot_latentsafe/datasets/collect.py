@@ -88,7 +88,11 @@ def _steer(state: np.ndarray, goal: np.ndarray) -> float:
 
 
 def goal_episodes(
-    n: int, rng: np.random.Generator, driver: Callable[[np.ndarray], float], noise: float = 0.2, max_steps: int = 80
+    n: int,
+    rng: np.random.Generator,
+    driver: Callable[[np.ndarray], float],
+    noise: float = 0.2,
+    max_steps: int = 80,
 ) -> Iterator[Episode]:
     """Demonstrations of the task of `DubinsEnv`, with a little noise on the turn rate for coverage."""
     for _ in range(n):

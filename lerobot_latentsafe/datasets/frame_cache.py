@@ -135,8 +135,7 @@ def build_frame_cache(dataset: "LeRobotDataset", output_dir: str | Path, image_s
     n = dataset.num_frames
     shape = (n, 3, image_size, image_size)
     arrays = {
-        key: np.lib.format.open_memmap(folder / f"{key}.npy", mode="w+", dtype=np.uint8, shape=shape)
-        for key in cameras
+        key: np.lib.format.open_memmap(folder / f"{key}.npy", mode="w+", dtype=np.uint8, shape=shape) for key in cameras
     }
     for i in trange(n, desc="decoding frames", unit="frame"):
         item = dataset[i]

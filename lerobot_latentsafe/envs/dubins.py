@@ -10,6 +10,8 @@ with v = 1 m/s, dt = 0.05 s and turn rate u in [-1.25, 1.25] rad/s. The failure 
 Everything is batched over states, so that data, truth and evaluation draw the very same pixels.
 """
 
+from typing import ClassVar
+
 import gymnasium as gym
 import numpy as np
 
@@ -37,9 +39,7 @@ ACTION_NAMES = ["turn_rate.vel"]
 def step(states: np.ndarray, turn_rates: np.ndarray) -> np.ndarray:
     """One Euler step. states: (..., 3), turn_rates: (...,) in rad/s -> (..., 3); headings are not wrapped."""
     x, y, heading = np.moveaxis(states, -1, 0)
-    return np.stack(
-        [x + DT * SPEED * np.cos(heading), y + DT * SPEED * np.sin(heading), heading + DT * turn_rates], -1
-    )
+    return np.stack([x + DT * SPEED * np.cos(heading), y + DT * SPEED * np.sin(heading), heading + DT * turn_rates], -1)
 
 
 def margin(states: np.ndarray) -> np.ndarray:
@@ -143,7 +143,7 @@ class DubinsEnv(gym.Env):
     allowed (the disc is a no-go zone, not a wall), leaving the view ends the episode.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}
+    metadata: ClassVar[dict] = {"render_modes": ["rgb_array"], "render_fps": FPS}
     variants = ("continuous", "discrete", "anywhere")
 
     def __init__(self, variant: str = "continuous", episode_length: int = 80, image_size: int = 128,

@@ -25,6 +25,11 @@ def select(latent: Latent, index: Tensor | slice) -> Latent:
     return map_latent(latent, lambda t: t[index])
 
 
+def replace_rows(latent: Latent, new: Latent, where: Tensor) -> Latent:
+    """Rows of `new` where the mask (B,) holds, of `latent` elsewhere."""
+    return map_latent(latent, lambda a, b: torch.where(where.reshape(-1, *[1] * (a.ndim - 1)), b, a), new)
+
+
 @dataclass
 class Clip:
     """A batch of aligned windows of episodes, what a world model trains on.
@@ -98,9 +103,7 @@ class WorldModel(nn.Module, abc.ABC):
     def loss(self, clip: Clip) -> tuple[Tensor, Tensor, dict[str, float]]:
         """Training loss, features (B, T, D) of the posterior for the co-trained margin, and metrics."""
 
-    def observe(
-        self, latent: Latent | None, action: Tensor | None, images: dict[str, Tensor], state: Tensor
-    ) -> Latent:
+    def observe(self, latent: Latent | None, action: Tensor | None, images: dict[str, Tensor], state: Tensor) -> Latent:
         """Posterior after acting and seeing: one tick of the filter. `latent` None starts an episode."""
         if latent is None:
             latent = self.initial(len(state))
@@ -112,10 +115,7 @@ class WorldModel(nn.Module, abc.ABC):
         latents: list[Latent] = []
         latent = fresh = self.initial(len(clip.state))
         for t in range(clip.state.shape[1]):
-            first = clip.is_first[:, t]
-            latent = map_latent(
-                latent, lambda old, new, f=first: torch.where(f.reshape(-1, *[1] * (old.ndim - 1)), new, old), fresh
-            )
+            latent = replace_rows(latent, fresh, where=clip.is_first[:, t])
             images = {key: value[:, t] for key, value in clip.images.items()}
             latent = self.correct(self.step(latent, clip.action[:, t]), images, clip.state[:, t])
             latents.append(latent)

@@ -6,6 +6,7 @@ together. Imagination and filtering carry means, so they are deterministic.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 import torch.nn.functional as F
@@ -110,8 +111,11 @@ class _ImageDecoder(nn.Module):
             self.channels = channels[0]
             self.project = nn.Linear(feature_dim, channels[0] * 16)
             layers: list[nn.Module] = []
-            for n_in, n_out in zip(channels[:-1], channels[1:]):
-                layers += [nn.ConvTranspose2d(n_in, n_out, 4, 2, 1, bias=False), _ChannelNorm(n_out, eps=1e-3)]
+            for n_in, n_out in pairwise(channels):
+                layers += [
+                    nn.ConvTranspose2d(n_in, n_out, 4, 2, 1, bias=False),
+                    _ChannelNorm(n_out, eps=1e-3),
+                ]
                 layers.append(nn.SiLU())
             last = nn.ConvTranspose2d(channels[-1], 3, 4, 2, 1)
             self.net = nn.Sequential(*layers, last)
@@ -143,9 +147,7 @@ class RSSM(WorldModel):
         self.cameras = {key: key.replace(".", "_") for key in self.image_keys}
         shape = (3, config.image_size, config.image_size)
         self.encoders = nn.ModuleDict({name: _ImageEncoder(config) for name in self.cameras.values()})
-        self.decoders = nn.ModuleDict(
-            {name: _ImageDecoder(config, self.feature_dim) for name in self.cameras.values()}
-        )
+        self.decoders = nn.ModuleDict({name: _ImageDecoder(config, self.feature_dim) for name in self.cameras.values()})
         for name in self.cameras.values():
             self.register_buffer(f"mean_{name}", torch.zeros(shape))
         self.register_buffer("mean_count", torch.zeros(()))
@@ -171,7 +173,7 @@ class RSSM(WorldModel):
         self.h0 = nn.Parameter(torch.zeros(h))
         self.continues = nn.Sequential(_mlp(self.feature_dim, config.state_units, 1), nn.Linear(config.state_units, 1))
 
-    # -- the model -----------------------------------------------------------------------------------------------
+    # -- the model ---
 
     def initial(self, batch_size: int) -> Latent:
         h = torch.tanh(self.h0).expand(batch_size, -1)
@@ -199,8 +201,7 @@ class RSSM(WorldModel):
     def decode(self, features: Tensor) -> dict[str, Tensor]:
         """Features (N, D) -> camera key -> images (N, 3, S, S), about in [0, 1]."""
         return {
-            key: self.decoders[name](features) + getattr(self, f"mean_{name}")
-            for key, name in self.cameras.items()
+            key: self.decoders[name](features) + getattr(self, f"mean_{name}") for key, name in self.cameras.items()
         }
 
     def _recur(self, h: Tensor, x: Tensor, action: Tensor) -> Tensor:
@@ -226,7 +227,7 @@ class RSSM(WorldModel):
     def _centred(self, key: str, images: dict[str, Tensor]) -> Tensor:
         return images[key] - getattr(self, f"mean_{self.cameras[key]}")
 
-    # -- learning ------------------------------------------------------------------------------------------------
+    # -- learning ---
 
     def loss(self, clip: Clip) -> tuple[Tensor, Tensor, dict[str, float]]:
         """Reconstruction + balanced KL + continuation; samples x so that the model is trained as a distribution."""
@@ -279,7 +280,11 @@ class RSSM(WorldModel):
         dynamics = _gaussian_kl(mean.detach(), std.detach(), prior_mean, prior_std)
         representation = _gaussian_kl(mean, std, prior_mean.detach(), prior_std.detach())
         mean_of = lambda kl: (kl * weight).sum()  # noqa: E731
-        return mean_of(dynamics.clamp(min=free)), mean_of(representation.clamp(min=free)), mean_of(dynamics).detach()
+        return (
+            mean_of(dynamics.clamp(min=free)),
+            mean_of(representation.clamp(min=free)),
+            mean_of(dynamics).detach(),
+        )
 
     def _continue_loss(self, features: Tensor, clip: Clip) -> Tensor:
         known = (clip.terminal >= 0) & clip.valid

@@ -1,0 +1,98 @@
+"""Choosing epsilon on held-out episodes, and keeping the evidence beside it.
+
+On a recorded episode that ends in failure, a monitor with threshold epsilon warns at the first frame with
+V <= epsilon. Too small an epsilon warns late or never; too large a one cries wolf on episodes that never fail.
+"""
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+import torch
+
+from lerobot_latentsafe.datasets.clips import ClipReader
+from lerobot_latentsafe.datasets.labels import FAILING
+from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+
+
+@dataclass
+class Calibration:
+    """The chosen epsilon and what it was chosen on.
+
+    Attributes:
+        epsilon: the threshold.
+        missed: share of failing episodes without a warning at least `lead_steps` frames before the failure.
+        false_alarms: share of frames of episodes that never fail with V <= epsilon.
+        lead_steps: frames of warning asked for.
+        failing_episodes, safe_frames: how much evidence there was.
+    """
+
+    epsilon: float
+    missed: float
+    false_alarms: float
+    lead_steps: int
+    failing_episodes: int
+    safe_frames: int
+
+
+@torch.no_grad()
+def episode_values(policy: LatentSafePolicy, reader: ClipReader, episodes: np.ndarray) -> list[dict[str, np.ndarray]]:
+    """V and labels along whole episodes, filtered from their first frame: {value (T,), failure (T,)} each."""
+    if reader.cache is None:
+        raise ValueError("calibration reads encoded frames: run latentsafe cache and give its folder as --dataset.root")
+    device, rows = policy.device, []
+    for episode in episodes:
+        index = np.flatnonzero(reader.labels.episode == episode)
+        images, state = reader.cache.frames(index)
+        state = policy.normalise_state(state.to(device))
+        action = policy.normalise_action(torch.from_numpy(reader.cache.action[index]).to(device))
+        latent, values = None, []
+        for t in range(len(index)):
+            frame = {k: images[k][t : t + 1].to(device) for k in policy.world_model.image_keys}
+            previous = action[t - 1 : t] if t else None
+            latent = policy.world_model.observe(latent, previous, frame, state[t : t + 1])
+            values.append(policy.value(latent).item())
+        rows.append({"value": np.array(values), "failure": reader.labels.failure[index]})
+    return rows
+
+
+def calibrate(rows: list[dict[str, np.ndarray]], max_missed: float = 0.05, lead_steps: int = 3) -> Calibration:
+    """The smallest epsilon that warns in time on all but `max_missed` of the failing episodes.
+
+    Args:
+        rows: per episode V and labels; only episodes that are safe for their first `lead_steps` frames can be
+            warned about and count.
+
+    Raises:
+        ValueError: no failing or no safe episode among them.
+    """
+    best_before, safe = [], []
+    for row in rows:
+        failing = np.flatnonzero(row["failure"] == FAILING)
+        if not len(failing):
+            safe.append(row["value"])
+        elif failing[0] > lead_steps:
+            # epsilon must reach the lowest value seen early enough.
+            best_before.append(row["value"][: failing[0] - lead_steps + 1].min())
+    if not best_before or not safe:
+        raise ValueError(
+            f"{len(rows)} held-out episodes hold {len(best_before)} that fail after step {lead_steps} and {len(safe)} "
+            "that never fail; calibration needs both. Hold out more episodes (--n_episodes)"
+        )
+    reached = np.sort(best_before)
+    allowed = int(np.floor(max_missed * len(reached)))
+    epsilon = float(max(0.0, reached[len(reached) - 1 - allowed]))
+    quiet = np.concatenate(safe)
+    return Calibration(
+        epsilon=epsilon,
+        missed=float((reached > epsilon).mean()),
+        false_alarms=float((quiet <= epsilon).mean()),
+        lead_steps=lead_steps,
+        failing_episodes=len(reached),
+        safe_frames=len(quiet),
+    )
+
+
+def store(policy: LatentSafePolicy, calibration: Calibration) -> None:
+    """Set the policy's epsilon and keep the evidence in its config."""
+    policy.config.epsilon = calibration.epsilon
+    policy.config.calibration = {k: float(v) for k, v in asdict(calibration).items()}

@@ -1,0 +1,107 @@
+"""Pictures where people would rather look."""
+
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+
+from lerobot_latentsafe.envs import dubins
+from lerobot_latentsafe.evaluation.ground_truth import exact_value
+from lerobot_latentsafe.evaluation.monitor import Monitor
+from lerobot_latentsafe.evaluation.shielding import Episodes
+
+
+def save(figure: Figure, path: str | Path) -> None:
+    """Write a PNG, making folders as needed."""
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110, bbox_inches="tight")
+    plt.close(figure)
+
+
+def value_slices(monitors: dict[str, Monitor], turn_rates=tuple(dubins.TURN_RATES), n: int = 71) -> Figure:
+    """V over (x, y) at headings 0 and 90 degrees, its zero level against the exact one (the paper's figure)."""
+    headings = (0.0, np.pi / 2)
+    figure, axes = plt.subplots(len(monitors), 2, figsize=(8.4, 3.9 * len(monitors)), squeeze=False)
+    axis = np.linspace(-dubins.VIEW, dubins.VIEW, n)
+    for row, (name, monitor) in zip(axes, monitors.items()):
+        for ax, heading in zip(row, headings):
+            x, y = np.meshgrid(axis, axis)
+            states = np.stack([x.ravel(), y.ravel(), np.full(n * n, heading)], -1)
+            value = monitor.value(states).reshape(n, n)
+            exact = exact_value(states, turn_rates).reshape(n, n)
+            scale = max(1e-6, np.abs(value).max())
+            shade = ax.pcolormesh(x, y, value, cmap="RdBu", vmin=-scale, vmax=scale, shading="auto")
+            ax.contour(x, y, value, [0.0], colors="k", linewidths=2)
+            ax.contour(x, y, exact, [0.0], colors="k", linewidths=2, linestyles="--")
+            ax.add_patch(plt.Circle((0, 0), dubins.RADIUS, fill=False, color="tab:red", lw=2))
+            ax.arrow(-0.95, -0.95, 0.2 * np.cos(heading), 0.2 * np.sin(heading), width=0.015, color="tab:blue")
+            ax.set(
+                title=f"{name}: heading {np.degrees(heading):.0f}°",
+                aspect="equal",
+                xlabel="x (m)",
+                ylabel="y (m)",
+            )
+            figure.colorbar(shade, ax=ax, label="V", shrink=0.8)
+    figure.suptitle("solid: learned boundary V = 0, dashed: exact, red: failure set")
+    figure.tight_layout()
+    return figure
+
+
+def trajectories(episodes: dict[str, Episodes]) -> Figure:
+    """Where the car went; red where the failure set was entered, orange where the filter acted."""
+    figure, axes = plt.subplots(1, len(episodes), figsize=(4.6 * len(episodes), 4.6), squeeze=False)
+    for ax, (name, runs) in zip(axes[0], episodes.items()):
+        for trace, violated in zip(runs.traces, runs.violation):
+            path = np.array(trace["state"])
+            ax.plot(path[:, 0], path[:, 1], color="tab:red" if violated else "tab:blue", lw=0.7, alpha=0.5)
+            acted = np.flatnonzero(trace.get("intervened", []))
+            ax.plot(path[acted, 0], path[acted, 1], ".", color="tab:orange", ms=2.5)
+        ax.add_patch(plt.Circle((0, 0), dubins.RADIUS, color="tab:red", alpha=0.15))
+        rate = runs.violation.mean()
+        ax.set(title=f"{name}: {rate:.0%} enter the disc", aspect="equal", xlim=(-1.15, 1.15), ylim=(-1.15, 1.15))
+        ax.set(xlabel="x (m)", ylabel="y (m)")
+    figure.tight_layout()
+    return figure
+
+
+def value_trace(trace: dict[str, list], epsilon: float) -> Figure:
+    """V and l along one shielded episode, the filter's moments shaded."""
+    t = np.arange(len(trace["value"])) * dubins.DT
+    figure, ax = plt.subplots(figsize=(7, 2.8))
+    ax.plot(t, trace["value"], label="V of the predicted next latent", color="tab:blue")
+    ax.plot(t, trace["margin"], label="margin l of the current latent", color="tab:gray")
+    ax.axhline(epsilon, color="k", lw=0.8, ls="--", label=f"epsilon = {epsilon:g}")
+    acted = np.array(trace["intervened"], bool)
+    ax.fill_between(t, -1, 1, where=acted, color="tab:orange", alpha=0.3, label="filter acts")
+    ax.set(xlabel="time (s)", ylim=(-1, 1))
+    ax.legend(fontsize=8, loc="lower right")
+    return figure
+
+
+def write_videos(runs: dict[str, Episodes], folder: str | Path, fps: int = dubins.FPS) -> list[Path]:
+    """One mp4 an episode, bare and shielded side by side, an orange frame while the filter acts."""
+    import cv2
+    from lerobot.utils.io_utils import write_video
+
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for i in range(min(len(r.frames) for r in runs.values())):
+        length = max(len(r.frames[i]) for r in runs.values())
+        columns = []
+        for name, r in runs.items():
+            frames = [cv2.resize(f, (256, 256), interpolation=cv2.INTER_NEAREST) for f in r.frames[i]]
+            for t, frame in enumerate(frames):
+                cv2.putText(frame, name, (8, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (40, 40, 40), 1, cv2.LINE_AA)
+                acted = r.traces[i].get("intervened", [])
+                if t < len(acted) and acted[t]:
+                    cv2.rectangle(frame, (0, 0), (255, 255), (255, 140, 0), 6)
+            columns.append(frames + [frames[-1]] * (length - len(frames)))
+        path = folder / f"episode_{i:03d}.mp4"
+        write_video(str(path), [np.concatenate(pair, 1) for pair in zip(*columns)], fps)
+        paths.append(path)
+    return paths
