@@ -182,8 +182,8 @@ class Push:
 class EvalMonitor:
     """Compare a filter's verdict V > 0 with the exact safe set, and drive its fallback policy from feasible starts.
 
-    Truths: discrete (the car's exact discrete-time value with three actions) or continuous (the paper's: hj_reachability
-    on its grid). Without --states the paper's grid of 51 x 51 x 53 states is scored.
+    Truths: discrete (the car's exact discrete-time value with three actions) or continuous (the paper's:
+    hj_reachability on its grid). Without --states the paper's grid of 51 x 51 x 53 states is scored.
     """
 
     env: EnvConfig
@@ -266,9 +266,8 @@ class EvalShield:
                 *(f"{k} {v['k']}/{v['n']}" for k, v in rates.items() if isinstance(v, dict)),
                 sep="  ",
             )
-        print(
-            f"overridden {row['shielded']['overridden_share']:.1%} of steps, violations p = {row['violation_p_value']:.2g}"
-        )
+        share, p_value = row["shielded"]["overridden_share"], row["violation_p_value"]
+        print(f"overridden {share:.1%} of steps, difference in violations p = {p_value:.2g}")
         if self.json:
             write_json(self.json, row)
         if self.figure:

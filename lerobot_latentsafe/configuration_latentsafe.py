@@ -26,7 +26,8 @@ class LatentSafeConfig(PreTrainedConfig):
         failure_specification: name of the failure labels: a dataset column or a sidecar file.
         frame_cache: folder made by `latentsafe cache`; by default the one in the dataset's folder, if there is one.
         reachability: actor-critic sizes and schedule.
-        action_candidates: the discrete action set in robot units, e.g. [[-1.25], [0.0], [1.25]]; None: continuous.
+        action_candidates: the discrete action set in robot units, e.g. [[-1.25, 1], [0, 1], [1.25, 1]]; None:
+            actions are continuous.
         stage: how far training has come: untrained, world_model, reachability. Set by the training commands.
         epsilon: the filter intervenes where V of the predicted next latent is at or below this.
         calibration: the evidence epsilon was chosen on; written by `latentsafe calibrate`.
@@ -36,6 +37,7 @@ class LatentSafeConfig(PreTrainedConfig):
         cameras: the image features the filter reads, by default all of the dataset's.
         fps, state_names, action_names, action_low, action_high, state_mean, state_std: what the filter was trained
             on, in robot units; filled in from the dataset.
+        action_varies: False for commands the data never vary; the filter keeps those and knows nothing else of them.
     """
 
     world_model: WorldModelConfig = field(default_factory=RSSMConfig)
@@ -62,6 +64,7 @@ class LatentSafeConfig(PreTrainedConfig):
     action_names: list[str] | None = None
     action_low: list[float] | None = None
     action_high: list[float] | None = None
+    action_varies: list[bool] | None = None
     state_mean: list[float] | None = None
     state_std: list[float] | None = None
 

@@ -25,6 +25,8 @@ from lerobot_latentsafe.world_models.base import Latent
 logger = logging.getLogger(__name__)
 
 BASE_FOLDER = "base_policy"
+CONSTANT_BAND = 0.05
+"""Relative half-width of the range of a command that never varies in the data."""
 
 
 class UntrainedFilterError(RuntimeError):
@@ -54,10 +56,13 @@ class LatentSafePolicy(PreTrainedPolicy):
         self.margin = FailureMargin(self.world_model.feature_dim, config.margin_hidden, config.margin_layers)
         for name in ("action_low", "action_high", "state_mean", "state_std"):
             self.register_buffer(name, torch.tensor(getattr(config, name), dtype=torch.float32), persistent=False)
+        self.register_buffer("action_varies", torch.tensor(config.action_varies), persistent=False)
         candidates = None
         if config.action_candidates is not None:
             candidates = self.normalise_action(torch.tensor(config.action_candidates, dtype=torch.float32))
-        self.critic = SafetyCritic(self.world_model.feature_dim, n_actions, candidates, config.reachability)
+        self.critic = SafetyCritic(
+            self.world_model.feature_dim, n_actions, candidates, config.reachability, self.action_varies
+        )
         self._base: list[BasePolicy] = []  # in a list, so that its weights are not ours
         self.shield = Shield(self)
         if config.base_policy_path:
@@ -85,7 +90,9 @@ class LatentSafePolicy(PreTrainedPolicy):
 
     def hold_action(self, batch_size: int) -> Tensor:
         """What to do when nothing can be known: zero motion, or the nearest the range allows."""
-        return torch.zeros_like(self.action_low).clamp(self.action_low, self.action_high).repeat(batch_size, 1)
+        middle = (self.action_low + self.action_high) / 2
+        still = torch.zeros_like(middle).clamp(self.action_low, self.action_high)
+        return torch.where(self.action_varies, still, middle).repeat(batch_size, 1)
 
     # -- training (stage 1) ---
 
@@ -251,9 +258,13 @@ def _adopt_dataset(config: LatentSafeConfig, meta, stats: dict) -> None:
         setattr(config, name, value)
     if config.action_low is None:
         low, high = _list(stats["action"]["min"]), _list(stats["action"]["max"])
-        if any(h - l <= 0 for l, h in zip(low, high)):
-            raise ValueError(f"action of {meta.repo_id} never changes in some dimension: min {low}, max {high}")
-        config.action_low, config.action_high = low, high
+        config.action_varies = [h - l > 1e-6 for l, h in zip(low, high)]
+        if not any(config.action_varies):
+            raise ValueError(f"the actions of {meta.repo_id} never change: {low}; record episodes that move")
+        # A command that never varies gets a band around it, so that float noise is not out of range.
+        band = [0.0 if v else CONSTANT_BAND * max(abs(l), 1.0) for v, l in zip(config.action_varies, low)]
+        config.action_low = [l - b for l, b in zip(low, band)]
+        config.action_high = [h + b for h, b in zip(high, band)]
         config.state_mean = _list(stats["observation.state"]["mean"])
         config.state_std = [max(s, 1e-3) for s in _list(stats["observation.state"]["std"])]
     # The data's actions decide the candidates' range check.

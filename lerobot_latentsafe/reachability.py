@@ -113,13 +113,23 @@ class SafetyCritic(nn.Module):
         feature_dim: D.
         action_dim: A.
         candidates: (K, A) in [-1, 1], the discrete action set, or None for continuous actions.
+        varies: bool (A,), the commands a continuous policy may move; the others stay at 0, all by default.
     """
 
-    def __init__(self, feature_dim: int, action_dim: int, candidates: Tensor | None, config: ReachabilityConfig):
+    def __init__(
+        self,
+        feature_dim: int,
+        action_dim: int,
+        candidates: Tensor | None,
+        config: ReachabilityConfig,
+        varies: Tensor | None = None,
+    ):
         super().__init__()
         self.register_buffer("feature_mean", torch.zeros(feature_dim))
         self.register_buffer("feature_std", torch.ones(feature_dim))
         self.register_buffer("candidates", candidates)
+        varies = torch.ones(action_dim) if varies is None else varies.float()
+        self.register_buffer("varies", varies, persistent=False)
         self.discrete = candidates is not None
         n_out = len(candidates) if self.discrete else 1
         n_in = feature_dim + (0 if self.discrete else action_dim)
@@ -146,7 +156,7 @@ class SafetyCritic(nn.Module):
         """The fallback action argmax_a Q in [-1, 1]: (..., D) -> (..., A)."""
         if self.discrete:
             return self.candidates[self.q(x).argmax(-1)]
-        return torch.tanh(self.actor(x))
+        return torch.tanh(self.actor(x)) * self.varies
 
     def value(self, features: Tensor, margin: Tensor) -> Tensor:
         """V = min(l, max_a Q) at raw features (..., D) with bounded margin (...,)."""
@@ -239,7 +249,9 @@ class LatentReachability:
         shape = critic.act(x).shape
         random = 2 * self._rand(*shape) - 1
         noisy = (critic.act(x) + 0.3 * torch.randn(shape, generator=self.generator, device=x.device)).clamp(-1, 1)
-        return torch.where(greedy[:, None], noisy, random), torch.zeros(n, dtype=torch.long, device=x.device)
+        return torch.where(greedy[:, None], noisy, random) * critic.varies, torch.zeros(
+            n, dtype=torch.long, device=x.device
+        )
 
     def _rand(self, *shape: int) -> Tensor:
         return torch.rand(*shape, generator=self.generator, device=self.critic.feature_mean.device)

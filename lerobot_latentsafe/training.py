@@ -77,7 +77,9 @@ def train_reachability(
     generator = torch.Generator(device="cpu").manual_seed(seed)
     imagination = LatentImagination(policy.world_model, policy.margin)
     candidates = policy.critic.candidates
-    critic = SafetyCritic(policy.world_model.feature_dim, policy.world_model.action_dim, candidates, config)
+    critic = SafetyCritic(
+        policy.world_model.feature_dim, policy.world_model.action_dim, candidates, config, policy.action_varies
+    )
     policy.critic = critic.to(policy.device)
     started = time.process_time()
     learner = LatentReachability(imagination, policy.critic, encoded_starts(policy, reader, generator), config)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 FEATURES = {
     "observation.image": {"dtype": "image", "shape": (128, 128, 3), "names": ["height", "width", "channels"]},
     "observation.state": {"dtype": "float32", "shape": (2,), "names": dubins.STATE_NAMES},
-    "action": {"dtype": "float32", "shape": (1,), "names": dubins.ACTION_NAMES},
+    "action": {"dtype": "float32", "shape": (2,), "names": dubins.ACTION_NAMES},
     "failure": {"dtype": "int64", "shape": (1,), "names": None},
     "next.done": {"dtype": "bool", "shape": (1,), "names": None},
 }
@@ -175,7 +175,7 @@ def episode_frames(episode: Episode, renderer: dubins.Renderer, features: dict) 
             "observation.image": seen["image"][t],
             "observation.state": seen["heading"][t],
             "observation.environment_state": seen["position"][t],
-            "action": np.array([turn_rate], np.float32),
+            "action": np.array([turn_rate, dubins.SPEED], np.float32),
             "failure": np.array([FAILING if failing[t] else SAFE]),
             "next.done": np.array([episode.ended and t == last]),
         }

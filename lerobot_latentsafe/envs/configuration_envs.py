@@ -26,7 +26,7 @@ class LatentSafeDubinsEnv(EnvConfig):
     image_size: int = 128
     features: dict[str, PolicyFeature] = field(
         default_factory=lambda: {
-            ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(1,)),
+            ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(2,)),
             "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(2,)),
             "environment_state": PolicyFeature(type=FeatureType.ENV, shape=(2,)),
         }

@@ -33,7 +33,9 @@ ARENA = 1.0
 
 STATE_NAMES = ["heading_cos.pos", "heading_sin.pos"]
 POSITION_NAMES = ["x.pos", "y.pos"]
-ACTION_NAMES = ["turn_rate.vel"]
+ACTION_NAMES = ["turn_rate.vel", "speed.vel"]
+"""Commands in rad/s and m/s. The speed is always 1: LeRobot 0.6.1 squeezes actions of a single number, and its
+policies then fail to train, so the constant is recorded too."""
 
 
 def step(states: np.ndarray, turn_rates: np.ndarray) -> np.ndarray:
@@ -137,6 +139,7 @@ def sample_task_start(rng: np.random.Generator, min_value: float = 0.02) -> np.n
 class DubinsEnv(gym.Env):
     """Drive from the left edge to the right edge of the arena without entering the disc.
 
+    Actions are (turn rate, speed); the drive holds 1 m/s whatever speed is asked for.
     Variants: `continuous` takes any turn rate in [-1.25, 1.25] rad/s, `discrete` the nearest of the paper's
     three; `anywhere` is `continuous` from a random state of the arena with V > 0.02, in any heading.
     Success: reaching x >= 0.9 without ever having been in the failure set. Driving on after a failure is
@@ -155,7 +158,8 @@ class DubinsEnv(gym.Env):
         self.task_description = "drive to the right edge without entering the red disc"
         self.task = self.task_description
         self.renderer = Renderer(image_size)
-        self.action_space = gym.spaces.Box(-MAX_TURN_RATE, MAX_TURN_RATE, (1,), np.float32)
+        low, high = np.array([-MAX_TURN_RATE, SPEED]), np.array([MAX_TURN_RATE, SPEED])
+        self.action_space = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32))
         self.observation_space = gym.spaces.Dict(
             {
                 "pixels": gym.spaces.Box(0, 255, (image_size, image_size, 3), np.uint8),
@@ -180,8 +184,8 @@ class DubinsEnv(gym.Env):
 
     def step(self, action: np.ndarray):
         action = np.asarray(action, float).reshape(-1)
-        if action.shape != (1,) or not np.isfinite(action).all():
-            raise ValueError(f"action is {action}; expected one finite turn rate in rad/s")
+        if action.shape != (2,) or not np.isfinite(action).all():
+            raise ValueError(f"action is {action}; expected a finite turn rate in rad/s and the speed in m/s")
         turn_rate = float(np.clip(action[0], -MAX_TURN_RATE, MAX_TURN_RATE))
         if self.variant == "discrete":
             turn_rate = snap_to_three_actions(turn_rate)

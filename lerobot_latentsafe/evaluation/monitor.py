@@ -62,9 +62,9 @@ class LatentMonitor:
         heading = states[:, 2]
         travelled = dubins.DT * dubins.SPEED * np.stack([np.cos(heading), np.sin(heading)], -1)
         before = np.concatenate([states[:, :2] - travelled, heading[:, None]], -1)
-        straight = self.policy.normalise_action(torch.zeros(len(states), 1, device=self.policy.device))
+        straight = self.policy.normalise_action(torch.tensor([[0.0, dubins.SPEED]], device=self.policy.device))
         latent = self.policy.world_model.observe(None, None, *self._see(before))
-        return self.policy.world_model.observe(latent, straight, *self._see(states))
+        return self.policy.world_model.observe(latent, straight.expand(len(states), -1), *self._see(states))
 
     def start(self) -> Callable[[np.ndarray], np.ndarray]:
         policy = self.policy

@@ -1,0 +1,20 @@
+# Two commands do everything on a fresh machine, set-up included: `make demo` and `make test`.
+.PHONY: setup demo test lint results
+
+PYTHON = .venv/bin/python
+
+setup:
+	@scripts/setup.sh
+
+demo: setup
+	$(PYTHON) scripts/demo.py
+
+test: lint
+	HF_HUB_OFFLINE=1 $(PYTHON) -m pytest
+
+lint: setup
+	.venv/bin/ruff check .
+	.venv/bin/ruff format --check .
+
+results: setup
+	scripts/reproduce_dubins.sh
