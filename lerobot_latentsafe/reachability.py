@@ -76,7 +76,7 @@ class ReachabilityConfig:
         tau: rate of the target network.
         pool: imagined states kept; a part is imagined anew every `refresh` steps.
         greedy: share of imagined trajectories that follow the current fallback policy, which lets imagination visit
-            what the fallback would see; the others act at random.
+            what the fallback would see; the others act at random, each action held for 1 / `switch` steps on average.
     """
 
     critic_hidden: tuple[int, ...] = (128, 128, 128)
@@ -95,6 +95,7 @@ class ReachabilityConfig:
     pool: int = 102_400
     refresh: int = 500
     greedy: float = 0.5
+    switch: float = 0.1
 
 
 def _mlp(sizes: list[int], activation: str) -> nn.Sequential:
@@ -207,17 +208,20 @@ class LatentReachability:
         """Roll `chunk` starts out for `horizon` steps.
 
         Returns:
-            x (N, D) features and l (N,) margin; next_x (N, K, D), next_l and ended (N, K), where K successors are
-            those of all candidates, or of the one action (N, A) taken when actions are continuous.
+            x (N, D) features and the action taken (N, A); next_x (N, K, D), next_l and ended (N, K), where the K
+            successors are those of all candidates, of which `choice` (N,) was taken, or the only one when actions
+            are continuous; and what `_add_outcomes` says of the rest of the trajectory.
         """
         critic, config, n = self.critic, self.config, self.chunk
         latent = self.starts(n)
         greedy = self._rand(n) < config.greedy
+        held = self._random_actions(n)
         rows: list[dict[str, Tensor]] = []
         for _ in range(config.horizon):
             features = self.imagination.features(latent)
             x = critic.standardise(features)
-            action, choice = self._explore(x, greedy)
+            held = torch.where((self._rand(n) < config.switch)[:, None], self._random_actions(n), held)
+            action, choice = self._explore(x, greedy, held)
             tried = critic.candidates.unsqueeze(0).expand(n, -1, -1) if critic.discrete else action[:, None]
             k = tried.shape[1]
             repeated = map_latent(latent, lambda t, k=k: t.repeat_interleave(k, 0))
@@ -226,8 +230,8 @@ class LatentReachability:
             rows.append(
                 {
                     "x": x,
-                    "l": self.imagination.margin(latent),
                     "action": action,
+                    "choice": choice,
                     "next_x": critic.standardise(next_features).unflatten(0, (n, k)),
                     "next_l": self.imagination.margin(after).unflatten(0, (n, k)),
                     "ended": ended.unflatten(0, (n, k)),
@@ -237,21 +241,44 @@ class LatentReachability:
             latent = select(after, taken)
             if ended[taken].any():
                 latent = replace_rows(latent, self.starts(n), where=ended[taken])
+        self._add_outcomes(rows)
         return {key: torch.cat([row[key] for row in rows]) for key in rows[0]}
 
-    def _explore(self, x: Tensor, greedy: Tensor) -> tuple[Tensor, Tensor]:
-        """Actions (n, A) and the index of the successor they lead to (n,)."""
-        n, critic = len(x), self.critic
+    @staticmethod
+    def _add_outcomes(rows: list[dict[str, Tensor]]) -> None:
+        """What came of each action taken: the worst margin until the trajectory's end, and the latent it ended in.
+
+        Adds worst (N,), end_x (N, D) and end_over (N,): whether the episode was over there.
+        """
+        later: dict[str, Tensor] | None = None
+        for row in reversed(rows):
+            each = torch.arange(len(row["choice"]), device=row["choice"].device)
+            margin, over, x = (row[key][each, row["choice"]] for key in ("next_l", "ended", "next_x"))
+            if later is None:
+                row |= {"worst": margin, "end_x": x, "end_over": over}
+            else:
+                row["worst"] = torch.where(over, margin, torch.minimum(margin, later["worst"]))
+                row["end_x"] = torch.where(over[:, None], x, later["end_x"])
+                row["end_over"] = over | later["end_over"]
+            later = row
+
+    def _random_actions(self, n: int) -> Tensor:
+        """(n, A): the index of a candidate in the first column, or an action if they are continuous."""
+        critic = self.critic
         if critic.discrete:
-            random = torch.randint(len(critic.candidates), (n,), generator=self.generator, device=x.device)
-            choice = torch.where(greedy, critic.q(x).argmax(-1), random)
+            return torch.randint(len(critic.candidates), (n, 1), generator=self.generator, device=critic.varies.device)
+        return (2 * self._rand(n, len(critic.varies)) - 1) * critic.varies
+
+    def _explore(self, x: Tensor, greedy: Tensor, held: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions (n, A) and the index of the successor they lead to (n,)."""
+        critic = self.critic
+        if critic.discrete:
+            choice = torch.where(greedy, critic.q(x).argmax(-1), held[:, 0])
             return critic.candidates[choice], choice
-        shape = critic.act(x).shape
-        random = 2 * self._rand(*shape) - 1
-        noisy = (critic.act(x) + 0.3 * torch.randn(shape, generator=self.generator, device=x.device)).clamp(-1, 1)
-        return torch.where(greedy[:, None], noisy, random) * critic.varies, torch.zeros(
-            n, dtype=torch.long, device=x.device
-        )
+        action = critic.act(x)
+        noise = 0.3 * torch.randn(action.shape, generator=self.generator, device=x.device) * critic.varies
+        action = torch.where(greedy[:, None], (action + noise).clamp(-1, 1), held)
+        return action, torch.zeros(len(x), dtype=torch.long, device=x.device)
 
     def _rand(self, *shape: int) -> Tensor:
         return torch.rand(*shape, generator=self.generator, device=self.critic.feature_mean.device)
@@ -268,7 +295,7 @@ class LatentReachability:
     @torch.no_grad()
     def _refresh_pool(self) -> None:
         fresh = self.imagine()
-        n, size = len(fresh["l"]), len(self.pool["l"])
+        n, size = len(fresh["choice"]), len(self.pool["choice"])
         for key, value in fresh.items():
             self.pool[key][self._oldest : self._oldest + n] = value
         self._oldest = (self._oldest + n) % size
@@ -286,7 +313,7 @@ class LatentReachability:
             self._refresh_pool()
         gamma = discount(progress, config)
         picked = torch.randint(
-            len(self.pool["l"]), (config.batch_size,), generator=self.generator, device=self.pool["l"].device
+            len(self.pool["choice"]), (config.batch_size,), generator=self.generator, device=self.pool["choice"].device
         )
         batch = {key: value[picked] for key, value in self.pool.items()}
         target = self._td_target(batch, gamma)
@@ -314,14 +341,22 @@ class LatentReachability:
 
     @torch.no_grad()
     def _td_target(self, batch: dict[str, Tensor], gamma: float) -> Tensor:
-        """Targets of Q(z, a) = V(z'), Eq. 5 read at the successor: (batch, K)."""
+        """Targets of Q(z, a) = V(z'), Eq. 5 read at the successor: (batch, K).
+
+        What an imagined trajectory achieved bounds the value of its first action from below: where that is more than
+        the one-step target, it is the target. Otherwise the errors of 25 chained minima add up to false alarms.
+        """
         x, l, ended = batch["next_x"], batch["next_l"], batch["ended"]
         if self.critic.discrete:  # double Q: the online network chooses, the target network judges
             choice = self.critic.q(x).argmax(-1, keepdim=True)
             future = self.target.q(x).gather(-1, choice).squeeze(-1)
         else:
             future = self.target.best_q(x)
-        return torch.where(ended, l, safety_bellman_target(l, future, gamma))
+        target = torch.where(ended, l, safety_bellman_target(l, future, gamma))
+        beyond = torch.where(batch["end_over"], torch.inf, self.target.best_q(batch["end_x"]))
+        achieved = torch.minimum(batch["worst"], beyond)[:, None]
+        taken = batch["choice"][:, None]
+        return target.scatter(1, taken, torch.maximum(target.gather(1, taken), achieved))
 
     def _actor_objective(self, x: Tensor) -> Tensor:
         """Mean Q of the actor's actions, with the critic's weights held fixed."""
