@@ -14,7 +14,6 @@ from itertools import pairwise
 from typing import Protocol
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from lerobot_latentsafe.margin import FailureMargin
@@ -67,12 +66,14 @@ class ReachabilityConfig:
     Attributes:
         critic_hidden, actor_hidden: widths of the hidden layers.
         activation: `tanh` or `relu`.
-        horizon: imagined steps before a start is drawn anew (25 in the paper).
+        horizon: imagined steps before a start is drawn anew (at most 25 in the paper). A short one keeps the pool
+            full of encoded observations, which is where the filter will ask.
         steps: gradient steps.
         batch_size: imagined states a gradient step; with discrete actions each is backed up under all of them.
         lr, actor_lr: AdamW step sizes, decayed over the second half.
         gamma: the final discount; 1 - gamma is annealed from `gamma_start` geometrically over `anneal` of the run,
             after `warmup` of the run at gamma = 0.
+        caution: weight of overestimates of V in the squared error, relative to underestimates.
         tau: rate of the target network.
         pool: imagined states kept; a part is imagined anew every `refresh` steps.
         greedy: share of imagined trajectories that follow the current fallback policy, which lets imagination visit
@@ -82,18 +83,19 @@ class ReachabilityConfig:
     critic_hidden: tuple[int, ...] = (128, 128, 128)
     actor_hidden: tuple[int, ...] = (256, 256)
     activation: str = "relu"
-    horizon: int = 25
-    steps: int = 8000
+    horizon: int = 8
+    steps: int = 12_000
     batch_size: int = 512
     lr: float = 1e-3
     actor_lr: float = 3e-4
     gamma: float = 0.9999
     gamma_start: float = 0.8
     warmup: float = 0.04
-    anneal: float = 0.46
+    anneal: float = 0.26
+    caution: float = 2.0
     tau: float = 0.05
-    pool: int = 102_400
-    refresh: int = 500
+    pool: int = 131_072
+    refresh: int = 250
     greedy: float = 0.5
     switch: float = 0.1
 
@@ -317,7 +319,7 @@ class LatentReachability:
         )
         batch = {key: value[picked] for key, value in self.pool.items()}
         target = self._td_target(batch, gamma)
-        critic_loss = F.mse_loss(self._predict(batch), target)
+        critic_loss = self._cautious_loss(self._predict(batch) - target)
         loss = critic_loss
         if self.critic.actor is not None:
             loss = loss - self._actor_objective(batch["x"])
@@ -333,6 +335,10 @@ class LatentReachability:
                 f"critic loss is {critic_loss.item()} at step {self.step_count}; lower --reachability.lr"
             )
         return {"critic_loss": critic_loss.item(), "gamma": gamma, "value": target.mean().item()}
+
+    def _cautious_loss(self, error: Tensor) -> Tensor:
+        """Squared error in which an overestimate, a danger missed, weighs `caution` times an underestimate."""
+        return (torch.where(error > 0, self.config.caution, 1.0) * error.square()).mean()
 
     def _predict(self, batch: dict[str, Tensor]) -> Tensor:
         if self.critic.discrete:
