@@ -125,8 +125,8 @@ def snap_to_three_actions(turn_rate: float) -> float:
     return float(TURN_RATES[np.abs(TURN_RATES - turn_rate).argmin()])
 
 
-def sample_task_start(rng: np.random.Generator, min_value: float = 0.02) -> np.ndarray:
-    """A start at the left edge, roughly facing the goal, from which safety is feasible (V > min_value)."""
+def sample_task_start(rng: np.random.Generator, min_value: float = 0.1) -> np.ndarray:
+    """A start at the left edge, facing the goal, roughly; safety is feasible with room: V > min_value (m^2)."""
     from lerobot_latentsafe.evaluation.ground_truth import exact_value
 
     while True:
