@@ -48,10 +48,23 @@ def _digest(file: Path) -> str:
     return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
+TRAINED = (
+    "stage", "world_model", "cameras", "fps", "state_names", "action_names", "action_low", "action_high",
+    "action_varies", "state_mean", "state_std", "action_candidates",
+)  # fmt: skip
+"""Entries of config.json that belong to the weights; epsilon, mode, device and the like are the user's."""
+
+
+def _trained_digest(folder: Path) -> str:
+    config = json.loads((folder / "config.json").read_text())
+    return hashlib.sha256(json.dumps({k: config.get(k) for k in TRAINED}, sort_keys=True).encode()).hexdigest()
+
+
 def seal(folder: Path) -> None:
-    """Record the weights' hash and size beside them."""
+    """Record the hash and size of the weights, and the hash of the config's entries that belong to them."""
     file = folder / WEIGHTS
-    (folder / INTEGRITY).write_text(json.dumps({"sha256": _digest(file), "bytes": file.stat().st_size}, indent=2))
+    record = {"sha256": _digest(file), "bytes": file.stat().st_size, "config_sha256": _trained_digest(folder)}
+    (folder / INTEGRITY).write_text(json.dumps(record, indent=2))
 
 
 def check_sealed(folder: Path) -> None:
@@ -66,7 +79,7 @@ def check_sealed(folder: Path) -> None:
         raise CheckpointError(f"{folder} lacks {', '.join(missing)}; expected a folder written by save_pretrained")
     try:
         expected = json.loads(record.read_text())
-        size, sha256 = expected["bytes"], expected["sha256"]
+        size, sha256, config_sha256 = expected["bytes"], expected["sha256"], expected["config_sha256"]
     except (json.JSONDecodeError, KeyError, TypeError) as e:
         raise CheckpointError(f"{record} is not readable ({e}); copy the checkpoint again") from e
     if file.stat().st_size != size:
@@ -77,4 +90,9 @@ def check_sealed(folder: Path) -> None:
         raise CheckpointError(
             f"{file} does not match its recorded hash: it was changed after saving. A safety filter with edited "
             "weights is not loaded; save it again with save_pretrained if the change was meant"
+        )
+    if _trained_digest(folder) != config_sha256:
+        raise CheckpointError(
+            f"{folder / 'config.json'} was edited: {', '.join(TRAINED)} belong to the weights. Restore it; only "
+            "epsilon, mode and other options may be changed by hand"
         )

@@ -56,6 +56,8 @@ def main(argv: list[str] | None = None) -> None:
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s")
     try:
         draccus.parse(command, args=options).run()
+    except draccus.utils.DecodingError as e:
+        sys.exit(f"latentsafe {verb}: {e}")
     except (ValueError, OSError, RuntimeError, ImportError, KeyError) as e:
         sys.exit(f"latentsafe {verb}: {e.args[0] if isinstance(e, KeyError) else e}")
 

@@ -115,11 +115,13 @@ class Calibrate:
 
         from lerobot_latentsafe.calibration import calibrate, episode_values, store
         from lerobot_latentsafe.datasets.clips import ClipReader
-        from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+        from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, adopt_dataset
         from lerobot_latentsafe.training import save_filter
 
         policy = LatentSafePolicy.from_pretrained(self.policy.path)
-        reader = ClipReader.of_dataset(policy.config, self.dataset.metadata())
+        meta = self.dataset.metadata()
+        adopt_dataset(policy.config, meta, meta.stats)
+        reader = ClipReader.of_dataset(policy.config, meta)
         episodes = np.unique(reader.labels.episode)[-self.n_episodes :]
         found = calibrate(episode_values(policy, reader, episodes), self.max_missed, self.lead_steps)
         store(policy, found)
@@ -217,6 +219,7 @@ class EvalMonitor:
         for name, entry in row.items():
             print(f"{name:20s} {entry:.4f}" if isinstance(entry, float) else f"{name:20s} {entry}")
         if self.values_out:
+            self.values_out.parent.mkdir(parents=True, exist_ok=True)
             np.save(self.values_out, value)
         if self.json:
             write_json(self.json, row)

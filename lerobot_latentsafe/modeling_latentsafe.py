@@ -8,6 +8,7 @@ import logging
 from pathlib import Path
 from typing import Any
 
+import draccus
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor
@@ -44,7 +45,7 @@ class LatentSafePolicy(PreTrainedPolicy):
         self.reader: ClipReader | None = None
         if dataset_meta is not None:
             self.reader = ClipReader.of_dataset(config, dataset_meta)
-            _adopt_dataset(config, dataset_meta, dataset_stats or dataset_meta.stats)
+            adopt_dataset(config, dataset_meta, dataset_stats or dataset_meta.stats)
         if config.action_low is None:
             raise UntrainedFilterError(
                 "this latentsafe policy has no dataset and no checkpoint: train one with lerobot-train "
@@ -218,7 +219,10 @@ class LatentSafePolicy(PreTrainedPolicy):
         hub = {k: kwargs.pop(k) for k in ("cache_dir", "token", "local_files_only", "force_download") if k in kwargs}
         folder = resolve_checkpoint(pretrained_name_or_path, revision, **{k: v for k, v in hub.items() if v})
         if config is None:
-            config = PreTrainedConfig.from_pretrained(folder)
+            try:
+                config = PreTrainedConfig.from_pretrained(folder)
+            except (OSError, ValueError, draccus.utils.DecodingError) as e:
+                raise CheckpointError(f"{folder / 'config.json'} is missing or not readable ({e})") from e
         if not isinstance(config, LatentSafeConfig):
             raise CheckpointError(
                 f"{pretrained_name_or_path} is a {config.type!r} policy, expected a 'latentsafe' filter; "
@@ -240,7 +244,7 @@ class LatentSafePolicy(PreTrainedPolicy):
         return make_model_card(self.config, dataset_repo_id, license, tags)
 
 
-def _adopt_dataset(config: LatentSafeConfig, meta, stats: dict) -> None:
+def adopt_dataset(config: LatentSafeConfig, meta, stats: dict) -> None:
     """Fill units and ranges in from a dataset, or check that it matches what the filter was trained on."""
     action, state = meta.features["action"], meta.features["observation.state"]
     found = {

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
+from safetensors import SafetensorError
 from torch import Tensor
 
 from lerobot_latentsafe.filter import FilterDecision, Reason, least_restrictive
@@ -172,7 +173,7 @@ class BasePolicy:
         from lerobot.configs.policies import PreTrainedConfig
         from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
-        from lerobot_latentsafe.checkpoint import resolve_checkpoint
+        from lerobot_latentsafe.checkpoint import CheckpointError, resolve_checkpoint
 
         self.path = resolve_checkpoint(path)
         config = PreTrainedConfig.from_pretrained(self.path)
@@ -183,7 +184,10 @@ class BasePolicy:
             )
         config.device = device
         self.config = config
-        self.policy = get_policy_class(config.type).from_pretrained(self.path, config=config)
+        try:
+            self.policy = get_policy_class(config.type).from_pretrained(self.path, config=config)
+        except SafetensorError as e:
+            raise CheckpointError(f"base policy {self.path} has unreadable weights ({e}); copy it again") from e
         self.preprocessor, self.postprocessor = make_pre_post_processors(
             config, pretrained_path=self.path, preprocessor_overrides={"device_processor": {"device": device}}
         )

@@ -8,7 +8,7 @@ import torch
 
 from lerobot_latentsafe.checkpoint import WEIGHTS, seal
 from lerobot_latentsafe.datasets.clips import ClipReader
-from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, adopt_dataset
 from lerobot_latentsafe.reachability import LatentImagination, LatentReachability, SafetyCritic, Starts
 from lerobot_latentsafe.world_models.base import Latent, map_latent, select
 
@@ -69,6 +69,7 @@ def train_reachability(
     torch.manual_seed(seed)
     policy = LatentSafePolicy.from_pretrained(path)
     policy.require_stage("world_model")
+    adopt_dataset(policy.config, dataset_meta, dataset_meta.stats)
     policy.config.frame_cache = None  # that of the first stage may be gone; the dataset brings its own
     reader = ClipReader.of_dataset(policy.config, dataset_meta)
     config = policy.config.reachability

@@ -238,7 +238,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--authors", type=Path, required=True, help="your clone of CMU-IntentLab/latent-safety")
     parser.add_argument("--batch", type=int, default=16, help="clips a batch, for all (default: the paper's 16)")
-    parser.add_argument("--clip", type=int, default=16, help="frames a clip, for all (default 16; the paper has 64)")
+    parser.add_argument(
+        "--clip",
+        type=int,
+        default=16,
+        help="frames a clip, for all (default 16; the paper has 64, few random episodes last as long)",
+    )
     parser.add_argument("--repeats", type=int, default=5, help="timed rounds after one to warm up (default 5)")
     parser.add_argument("--threads", type=int, default=1, help="threads of PyTorch, for all (default 1)")
     parser.add_argument("--seed", type=int, default=0, help="of recording and weights (default 0)")

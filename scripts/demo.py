@@ -162,13 +162,11 @@ def report(out: Path, seconds: float) -> None:
             html.heading("Bare and shielded from the same starts"),
             html.table(header, rows),
             html.paragraph(
-                f"Shares with 95% Wilson intervals. The filter acted in {metrics['overridden_share']:.0%} of the steps. "
+                f"Shares with 95% Wilson intervals. The filter acted in {metrics['overridden_share']:.0%} of all steps."
+                " "
                 f"Exact test of the paired difference in violations: p = {metrics['violation_p_value']:.1g}."
             ),
-            *(
-                html.video(path, "bare | shielded; orange: the filter acts")
-                for path in sorted(out.glob("videos/*.mp4"))
-            ),
+            *(html.video(path, "bare | shielded; orange: the filter acts") for path in videos),
             html.picture(out / "trajectories.png", "All runs. Red: entered the disc. Orange: the filter acted."),
             html.heading("The safe set it learnt from images"),
             html.table(["against the exact solution", ""], scores),
@@ -183,9 +181,8 @@ def report(out: Path, seconds: float) -> None:
     print()
     for row in [header, *rows]:
         print("".join(f"{cell:<30}" for cell in row))
-    print(
-        f"\nfilter acted in {metrics['overridden_share']:.1%} of steps; violations: p = {shield['violation_p_value']:.1g}"
-    )
+    acted, p_value = metrics["overridden_share"], metrics["violation_p_value"]
+    print(f"\nfilter acted in {acted:.1%} of steps; violations: p = {p_value:.1g}")
     print("monitor against the exact safe set:", ", ".join(f"{name} {value}" for name, value in scores))
     print(f"{metrics['minutes']} minutes. Open {out / 'report.html'}; numbers in {out / 'metrics.json'}")
 

@@ -69,8 +69,9 @@ def main() -> None:
     for path in arguments.filters:
         monitor = LatentMonitor(LatentSafePolicy.from_pretrained(path))
         latent_rows.append({**score(monitor.value(states), truths), **rollouts(monitor)})
-        plan = PlanMonitor(monitor)
-        plan_rows.append({**score(plan.value(states), truths), **rollouts(plan)})
+        if not plan_rows:  # a planner has nothing to learn: one world model and every fifth state will do
+            value = PlanMonitor(monitor).value(states[::5])
+            plan_rows.append(score(value, {name: true[::5] for name, true in truths.items()}))
         classifier_rows.append(score(monitor.margin(states), truths))
         print(path, {k: round(v, 4) for k, v in latent_rows[-1]["continuous"].items()}, flush=True)
 
@@ -82,8 +83,9 @@ def main() -> None:
         privileged_rows.append({**score(privileged.value(states), truths), **rollouts(privileged)})
         print("privileged", seed, {k: round(v, 4) for k, v in privileged_rows[-1]["continuous"].items()}, flush=True)
 
-    for name, rows in (("latent", latent_rows), ("privileged", privileged_rows), ("plan", plan_rows)):
+    for name, rows in (("latent", latent_rows), ("privileged", privileged_rows)):
         table[name] = {"seeds": rows, "summary": summary(rows)}
+    table["plan"] = {"seeds": plan_rows}
     table["failure_classifier_alone"] = {"seeds": classifier_rows}
     table["always_safe"] = {"seeds": [score(np.ones(len(states)), truths)]}
     header = {"figures": "each row against both truths; safe_policy and boundary are shares of runs that stay safe"}

@@ -72,8 +72,10 @@ class ClipReader:
             return self.cut(index, policy)
         images = {k: policy.model_images(batch[k]) for k in policy.world_model.image_keys}
         valid = ~batch["observation.state_is_pad"]
+        # LeRobot drops the last axis of features of a single number.
+        state, action = (batch[k].reshape(*valid.shape, -1) for k in ("observation.state", "action"))
         window = np.minimum(index[:, None] + np.arange(self.length), len(self.labels.failure) - 1)
-        return self._assemble(window, images, batch["observation.state"], batch["action"], valid, policy)
+        return self._assemble(window, images, state, action, valid, policy)
 
     def cut(self, start: np.ndarray, policy: "LatentSafePolicy") -> Clip:
         """Clips from the frame cache that start at the given frame indices (B,)."""

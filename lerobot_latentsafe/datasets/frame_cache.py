@@ -8,6 +8,7 @@ it by itself. Windows are cut the same way as LeRobot cuts them, so the losses e
 import hashlib
 import json
 import os
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -82,11 +83,14 @@ class FrameCache:
         folder = Path(root) / FOLDER
         try:
             manifest = json.loads((folder / MANIFEST).read_text())
-        except (OSError, json.JSONDecodeError) as e:
+            if manifest["version"] != VERSION:
+                raise KeyError("version")
+            fingerprint = manifest["fingerprint"]
+        except (OSError, json.JSONDecodeError, KeyError, TypeError) as e:
             raise FrameCacheError(
                 f"{folder} has no readable {MANIFEST}; the build was cut off. Delete it and run latentsafe cache again"
             ) from e
-        if meta is not None and manifest["fingerprint"] != dataset_fingerprint(meta):
+        if meta is not None and fingerprint != dataset_fingerprint(meta):
             raise FrameCacheError(
                 f"{folder} was made from {manifest['repo_id']} ({manifest['fingerprint']}), the dataset is "
                 f"{meta.repo_id} ({dataset_fingerprint(meta)}); run latentsafe cache on this dataset"
@@ -130,6 +134,8 @@ def build_frame_cache(dataset: "LeRobotDataset", output_dir: str | Path, image_s
     if not cameras:
         raise FrameCacheError(f"{dataset.repo_id} has no camera; its features are {list(dataset.meta.features)}")
     copy = remove_feature(dataset, cameras, output_dir=output_dir, repo_id=f"{dataset.repo_id}_cache")
+    if (Path(dataset.root) / "labels").exists():
+        shutil.copytree(Path(dataset.root) / "labels", output_dir / "labels")
     folder = output_dir / FOLDER
     folder.mkdir()
     n = dataset.num_frames

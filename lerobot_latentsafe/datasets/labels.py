@@ -52,12 +52,19 @@ class FailureLabels:
         order = np.argsort(data["index"])
         n = len(order)
         episode = data["episode_index"][order].astype(np.int64)
-        terminal = _as_labels(data["next.done"][order]) if "next.done" in data else np.full(n, UNLABELLED, np.int8)
+        terminal = np.full(n, UNLABELLED, np.int8)
+        if "next.done" in data:
+            terminal = _as_labels(data["next.done"][order], n, f"column 'next.done' of {root}")
         sidecar = root / "labels" / f"{specification}.parquet"
         if sidecar.exists():
             failure = _read_sidecar(sidecar, n)
         elif specification in data:
-            failure = _as_labels(data[specification][order])
+            if len(data[specification]) != n:
+                raise UnlabelledDatasetError(
+                    f"column {specification!r} of {root} holds {len(data[specification])} labels for {n} frames; "
+                    "expected one a frame"
+                )
+            failure = _as_labels(data[specification][order], n, f"column {specification!r} of {root}")
         else:
             raise UnlabelledDatasetError(
                 f"{root} has no failure labels: expected a column {specification!r} (1 failing, 0 safe, "
@@ -68,9 +75,6 @@ class FailureLabels:
         return labels
 
     def _check(self, root: Path, specification: str) -> None:
-        unknown = sorted(set(np.unique(self.failure)) - {FAILING, SAFE, UNLABELLED})
-        if unknown:
-            raise UnlabelledDatasetError(f"labels {specification!r} of {root} hold {unknown}; expected 1, 0 or -1")
         for value, name in ((FAILING, "failing"), (SAFE, "safe")):
             if not (self.failure == value).any():
                 raise UnlabelledDatasetError(
@@ -84,7 +88,13 @@ class FailureLabels:
         return float((self.failure == FAILING).sum() / (self.failure != UNLABELLED).sum())
 
 
-def _as_labels(values: np.ndarray) -> np.ndarray:
+def _as_labels(values: np.ndarray, n: int, source: str) -> np.ndarray:
+    """Exactly -1, 0 or 1 for each of n frames: what is cast to int8 unchecked could turn into "safe"."""
+    if values.shape != (n,):
+        raise UnlabelledDatasetError(f"{source} holds {values.size} labels for {n} frames; expected one a frame")
+    unknown = sorted({str(v) for v in values.tolist() if v not in (FAILING, SAFE, UNLABELLED)})
+    if unknown:
+        raise UnlabelledDatasetError(f"{source} holds {', '.join(unknown[:5])}; expected 1, 0 or -1")
     return values.astype(np.int8)
 
 
@@ -93,12 +103,12 @@ def _read_sidecar(path: Path, n: int) -> np.ndarray:
     missing = {"index", "failure"} - set(table.column_names)
     if missing:
         raise UnlabelledDatasetError(f"{path} lacks the columns {sorted(missing)}; expected index and failure")
-    index, failure = np.asarray(table["index"]), np.asarray(table["failure"])
+    index, failure = np.asarray(table["index"]), np.asarray(table["failure"].to_pylist())
     if len(index) != n or not np.array_equal(np.sort(index), np.arange(n)):
         raise UnlabelledDatasetError(
             f"{path} labels {len(index)} frames, the dataset has {n}; expected each index 0..{n - 1} once. "
             "It may belong to another dataset"
         )
     labels = np.full(n, UNLABELLED, np.int8)
-    labels[index] = failure
+    labels[index] = _as_labels(failure, n, str(path))
     return labels

@@ -1,0 +1,106 @@
+"""One tiny dataset, frame cache, filter and diffusion policy, made once and shared by all tests."""
+
+import os
+
+os.environ["OMP_NUM_THREADS"] = "1"
+os.environ["HF_HUB_OFFLINE"] = "1"
+os.environ["HF_HUB_DISABLE_PROGRESS_BARS"] = "1"
+os.environ["TQDM_DISABLE"] = "1"
+os.environ["MPLBACKEND"] = "Agg"
+os.environ["JAX_PLATFORMS"] = "cpu"
+os.environ["TOKENIZERS_PARALLELISM"] = "false"
+
+import logging
+import shutil
+
+import pytest
+import tiny
+import torch
+
+torch.set_num_threads(1)
+# torchcodec without system FFmpeg logs a page of traceback; LeRobot then falls back to pyav by itself.
+logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
+
+
+@pytest.fixture(autouse=True)
+def seeded():
+    torch.manual_seed(0)
+
+
+@pytest.fixture(scope="session")
+def dataset_root(tmp_path_factory):
+    """14 random episodes of the car, with failing and safe frames."""
+    from lerobot_latentsafe.datasets.collect import collect_dubins
+
+    root = tmp_path_factory.mktemp("data") / "car"
+    collect_dubins("random", tiny.REPO_ID, root, n_episodes=14, seed=3)
+    return root
+
+
+@pytest.fixture(scope="session")
+def dataset_meta(dataset_root):
+    return tiny.metadata(dataset_root)
+
+
+@pytest.fixture(scope="session")
+def cache_root(dataset_root, tmp_path_factory):
+    """The same dataset without images, with its frames at 32 pixels beside it."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from lerobot_latentsafe.datasets.frame_cache import build_frame_cache
+
+    root = tmp_path_factory.mktemp("data") / "car_cache"
+    build_frame_cache(LeRobotDataset(tiny.REPO_ID, root=dataset_root), root, 32)
+    return root
+
+
+@pytest.fixture(scope="session")
+def cache_meta(cache_root):
+    return tiny.metadata(cache_root)
+
+
+@pytest.fixture(scope="session")
+def tiny_world_model(cache_meta, tmp_path_factory):
+    """Folder of a filter after stage 1, discrete actions: its critic was never trained."""
+    return tiny.train_stage_one(cache_meta, tmp_path_factory.mktemp("stage_one"))
+
+
+@pytest.fixture(scope="session")
+def tiny_filter(tiny_world_model, cache_meta, tmp_path_factory):
+    """Folder of a filter with a trained critic, discrete actions."""
+    from lerobot_latentsafe.training import train_reachability
+
+    folder = tmp_path_factory.mktemp("filters") / "discrete"
+    train_reachability(tiny_world_model, cache_meta, folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def tiny_continuous_filter(cache_meta, tmp_path_factory):
+    """Folder of a filter with a trained critic, continuous actions."""
+    from lerobot_latentsafe.training import train_reachability
+
+    folder = tmp_path_factory.mktemp("filters")
+    stage_one = tiny.train_stage_one(cache_meta, folder / "stage_one", action_candidates=None)
+    train_reachability(stage_one, cache_meta, folder / "continuous")
+    return folder / "continuous"
+
+
+@pytest.fixture(scope="session")
+def tiny_diffusion(tmp_path_factory):
+    """Folder of a LeRobot DiffusionPolicy with random weights and its processors."""
+    return tiny.save_diffusion(tmp_path_factory.mktemp("diffusion"))
+
+
+@pytest.fixture
+def policy(tiny_filter):
+    """The tiny filter, loaded afresh."""
+    from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+
+    return LatentSafePolicy.from_pretrained(tiny_filter)
+
+
+@pytest.fixture
+def filter_copy(tiny_filter, tmp_path):
+    """A copy of the tiny filter's folder to break."""
+    return shutil.copytree(tiny_filter, tmp_path / "copy")

@@ -1,0 +1,160 @@
+"""Alignment of actions, images and labels, on a dataset whose entries count the frames."""
+
+import numpy as np
+import pytest
+import tiny
+import torch
+from lerobot.datasets.factory import resolve_delta_timestamps
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from lerobot_latentsafe.datasets.clips import ClipReader
+from lerobot_latentsafe.datasets.frame_cache import build_frame_cache
+from lerobot_latentsafe.datasets.labels import UnlabelledDatasetError
+
+LENGTHS = (11, 9)
+N = sum(LENGTHS)
+FIRST = np.cumsum((0, *LENGTHS))
+
+
+def record_counting(root, width=2):
+    """Frame i shows the grey level 10 i, has state (i, -i), and the action taken after it is (100 + i, -i)."""
+    names = ["count", "back"][:width]
+    features = {
+        "observation.image": {"dtype": "image", "shape": (8, 8, 3), "names": ["height", "width", "channels"]},
+        "observation.state": {"dtype": "float32", "shape": (width,), "names": [f"{name}.pos" for name in names]},
+        "action": {"dtype": "float32", "shape": (width,), "names": [f"{name}.vel" for name in names]},
+        "failure": {"dtype": "int64", "shape": (1,), "names": None},
+        "next.done": {"dtype": "bool", "shape": (1,), "names": None},
+    }
+    dataset = LeRobotDataset.create("me/counting", 10, features, root=root, use_videos=False)
+    i = 0
+    for length in LENGTHS:
+        for t in range(length):
+            image = np.full((8, 8, 3), 10 * i, np.uint8)
+            image[0, 0] = 255 - image[0, 0]
+            dataset.add_frame(
+                {
+                    "observation.image": image,
+                    "observation.state": np.array([i, -i][:width], np.float32),
+                    "action": np.array([100 + i, -i][:width], np.float32),
+                    "failure": np.array([i % 2]),
+                    "next.done": np.array([t == length - 1]),
+                    "task": "count",
+                }
+            )
+            i += 1
+        dataset.save_episode()
+    dataset.finalize()
+    return root
+
+
+def reading(root):
+    """Reads clips of a counting dataset by the frame they start at; `.policy` is whom they are read for."""
+    meta = tiny.metadata(root, "me/counting")
+    policy = tiny.new_policy(meta, world_model=tiny.rssm_config(image_size=8), action_candidates=None)
+    windows = resolve_delta_timestamps(policy.config, meta)
+    dataset = LeRobotDataset("me/counting", root=root, delta_timestamps=windows)
+
+    def read(*starts):
+        return policy.reader.read(torch.utils.data.default_collate([dataset[i] for i in starts]), policy)
+
+    read.policy = policy
+    return read
+
+
+@pytest.fixture(scope="module")
+def counting_root(tmp_path_factory):
+    return record_counting(tmp_path_factory.mktemp("data") / "counting")
+
+
+@pytest.fixture(scope="module", params=["decoded", "cached"])
+def clip_at(request, counting_root, tmp_path_factory):
+    root = counting_root
+    if request.param == "cached":
+        root = tmp_path_factory.mktemp("data") / "counting_cache"
+        build_frame_cache(LeRobotDataset("me/counting", root=counting_root), root, 8)
+    read = reading(root)
+    assert (read.policy.reader.cache is not None) == (request.param == "cached")
+    return read
+
+
+def test_action_is_the_one_that_led_to_each_frame(clip_at):
+    starts = [0, 2, FIRST[1], FIRST[1] + 1]
+    clip, policy = clip_at(*starts), clip_at.policy
+    for row, start in enumerate(starts):
+        stored = 100.0 + start + np.arange(clip.action.shape[1]) - 1  # frame t + k comes after the action of t + k - 1
+        expected = 2 * (stored - 100) / (N - 1) - 1
+        np.testing.assert_allclose(clip.action[row, 1:, 0], expected[1:], atol=1e-5)
+        np.testing.assert_allclose(clip.action[row, 1:, 1], -expected[1:], atol=1e-5)
+        assert (clip.action[row, 0] == 0).all()
+    taken = policy.denormalise_action(clip.action[0])[1:, 0]
+    np.testing.assert_allclose(taken, 100 + np.arange(clip.action.shape[1] - 1), atol=1e-4)
+
+
+def test_only_the_first_frame_of_a_clip_has_no_past(clip_at):
+    clip = clip_at(0, 3)
+    assert clip.is_first[:, 0].all() and not clip.is_first[:, 1:].any()
+
+
+def test_images_states_and_labels_belong_to_the_same_frames(clip_at):
+    clip, policy = clip_at(2, FIRST[1]), clip_at.policy
+    for row, start in enumerate((2, FIRST[1])):
+        frames = start + np.arange(8)
+        np.testing.assert_allclose(clip.images["observation.image"][row, :, 0, 4, 4] * 255, 10 * frames, atol=1e-3)
+        state = clip.state[row] * policy.state_std + policy.state_mean
+        np.testing.assert_allclose(state[:, 0], frames, atol=1e-4)
+        np.testing.assert_array_equal(clip.failure[row], frames % 2)
+        np.testing.assert_array_equal(clip.terminal[row], np.isin(frames, FIRST[1:] - 1))
+
+
+@pytest.mark.parametrize(("start", "inside"), [(0, 8), (3, 8), (4, 7), (10, 1), (N - 8, 8), (N - 3, 3), (N - 1, 1)])
+def test_nothing_past_the_episodes_end_is_valid(clip_at, start, inside):
+    clip = clip_at(start)
+    assert clip.valid[0].tolist() == [True] * inside + [False] * (8 - inside)
+    if inside < 8:  # padded with the last frame, not with the next episode
+        last = start + inside - 1
+        np.testing.assert_allclose(clip.images["observation.image"][0, inside:, 0, 4, 4] * 255, 10 * last, atol=1e-3)
+
+
+def test_what_is_not_valid_is_not_learned_from(clip_at, monkeypatch):
+    policy, clip = clip_at.policy.eval(), clip_at(int(FIRST[1]) - 3)
+    losses = []
+    for garbage in (0, 1):
+        clip.failure = torch.where(clip.valid, clip.failure, garbage)
+        clip.terminal = torch.where(clip.valid, clip.terminal, garbage)
+        clip.state = torch.where(clip.valid[..., None], clip.state, float(garbage))
+        monkeypatch.setattr(policy.reader, "read", lambda *_: clip)
+        torch.manual_seed(0)
+        losses.append(policy.forward({})[0].item())
+    assert not clip.valid.all() and losses[0] == losses[1]
+
+
+def test_actions_and_states_are_scaled_by_the_datasets_range(clip_at):
+    config = clip_at.policy.config
+    assert (config.action_low, config.action_high) == ([100.0, 1.0 - N], [100.0 + N - 1, 0.0])
+    assert config.state_mean[0] == pytest.approx((N - 1) / 2)
+    assert (config.fps, config.action_names, config.state_names) == (
+        10,
+        ["count.vel", "back.vel"],
+        ["count.pos", "back.pos"],
+    )
+
+
+def test_missing_camera_names_those_there_are(counting_root):
+    meta = tiny.metadata(counting_root, "me/counting")
+    config = tiny.config(cameras=["observation.images.wrist"])
+    with pytest.raises(ValueError, match=r"lacks the camera observation.images.wrist.*observation.image"):
+        ClipReader.of_dataset(config, meta)
+
+
+def test_robot_with_a_single_joint_is_decoded_too(tmp_path):
+    """LeRobot drops the last axis of features of a single number."""
+    clip = reading(record_counting(tmp_path / "single", width=1))(0, 2)
+    assert clip.action.shape == clip.state.shape == (2, 8, 1)
+    np.testing.assert_allclose(clip.action[1, 1:, 0], 2 * np.arange(2, 9) / (N - 1) - 1, atol=1e-5)
+
+
+def test_unlabelled_dataset_is_refused_before_training(counting_root):
+    meta = tiny.metadata(counting_root, "me/counting")
+    with pytest.raises(UnlabelledDatasetError, match="column 'spilled'"):
+        tiny.new_policy(meta, failure_specification="spilled")

@@ -1,0 +1,65 @@
+import pytest
+import torch
+
+from lerobot_latentsafe.margin import FailureMargin, hinge_loss
+
+
+def test_hinge_loss_by_hand():
+    margin = torch.tensor([1.0, 0.25, -1.0, 0.5])
+    failure = torch.tensor([0, 0, 1, 1])
+    # safe: (0 + 0.5) / 2, failing: (0 + 1.25) / 2
+    assert hinge_loss(margin, failure, delta=0.75).item() == pytest.approx(0.25 + 0.625)
+
+
+def test_hinge_loss_vanishes_beyond_delta():
+    margin = torch.tensor([0.75, 3.0, -0.75, -9.0])
+    assert hinge_loss(margin, torch.tensor([0, 0, 1, 1]), delta=0.75) == 0
+
+
+def test_each_class_weighs_the_same_however_rare():
+    margin = torch.zeros(100)
+    failure = torch.zeros(100, dtype=torch.long)
+    failure[0] = 1
+    assert hinge_loss(margin, failure, delta=0.5).item() == pytest.approx(1.0)
+
+
+def test_unlabelled_frames_are_ignored():
+    margin, failure = torch.tensor([[0.1, 5.0], [-0.2, -5.0]]), torch.tensor([[0, -1], [1, -1]])
+    margin.requires_grad_()
+    loss = hinge_loss(margin, failure)
+    assert loss.item() == pytest.approx(0.65 + 0.55)
+    loss.backward()
+    assert margin.grad[:, 1].eq(0).all() and margin.grad[:, 0].ne(0).all()
+
+
+@pytest.mark.parametrize(("label", "expected"), [(0, 0.75 - 0.2), (1, 0.75 + 0.2)])
+def test_one_class_alone_gives_its_own_term(label, expected):
+    margin = torch.full((4,), 0.2)
+    assert hinge_loss(margin, torch.full((4,), label)).item() == pytest.approx(expected)
+
+
+def test_nothing_labelled_gives_zero_with_a_gradient():
+    margin = torch.ones(3, requires_grad=True)
+    loss = hinge_loss(margin, torch.full((3,), -1))
+    loss.backward()
+    assert loss == 0 and margin.grad.eq(0).all()
+
+
+def test_shapes_and_bounds():
+    margin = FailureMargin(7, hidden=8, n_layers=2)
+    features = 50 * torch.randn(3, 5, 7)
+    assert margin(features).shape == (3, 5)
+    assert margin.bounded(features).abs().max() <= 1
+    assert (margin.bounded(features).sign() == margin(features).sign()).all()
+
+
+def test_it_learns_a_disc():
+    points = 2 * torch.rand(2000, 2) - 1
+    failure = (points.norm(dim=1) < 0.5).long()
+    margin = FailureMargin(2)
+    optimizer = torch.optim.Adam(margin.parameters(), 1e-2)
+    for _ in range(300):
+        optimizer.zero_grad()
+        hinge_loss(margin(points), failure).backward()
+        optimizer.step()
+    assert ((margin(points) < 0) == failure.bool()).float().mean() > 0.97

@@ -1,0 +1,63 @@
+"""The checkpoints that come with the package."""
+
+import numpy as np
+import pytest
+
+from lerobot_latentsafe.checkpoint import PRETRAINED, check_sealed, committed_names
+from lerobot_latentsafe.evaluation.ground_truth import exact_value
+from lerobot_latentsafe.evaluation.monitor import LatentMonitor
+from lerobot_latentsafe.evaluation.rollouts import confusion
+from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+from lerobot_latentsafe.shield import BasePolicy
+
+
+def size_of(name):
+    return sum(file.stat().st_size for file in (PRETRAINED / name).rglob("*") if file.is_file())
+
+
+def test_names_that_users_rely_on_are_committed():
+    assert {"dubins", "dubins_diffusion_reckless"} <= set(committed_names())
+
+
+def test_every_committed_checkpoint_loads():
+    from lerobot.configs.policies import PreTrainedConfig
+
+    assert committed_names()
+    for name in committed_names():
+        if PreTrainedConfig.from_pretrained(PRETRAINED / name).type == "latentsafe":
+            check_sealed(PRETRAINED / name)
+            assert LatentSafePolicy.from_pretrained(name).config.stage == "reachability"
+        else:
+            assert BasePolicy(name, "cpu").config.output_features["action"].shape == (2,)
+
+
+def test_filter_is_small():
+    assert 0 < size_of("dubins") <= 5 * 2**20
+
+
+def test_filter_stores_no_path_of_the_machine_it_was_trained_on():
+    config = LatentSafePolicy.from_pretrained("dubins").config
+    assert config.frame_cache is None and config.base_policy_path is None
+
+
+@pytest.fixture(scope="module")
+def states():
+    return np.random.default_rng(11).uniform([-1.1, -1.1, -np.pi], [1.1, 1.1, np.pi], (3000, 3))
+
+
+def test_filter_knows_the_safe_set(states):
+    monitor = LatentMonitor(LatentSafePolicy.from_pretrained("dubins"))
+    row = confusion(monitor.value(states) > 0, exact_value(states) > 0)
+    assert row["f1_safe"] >= 0.97
+    assert row["balanced_accuracy"] >= 0.96
+
+
+def test_filter_shields_the_committed_diffusion_policy():
+    from lerobot_latentsafe import LatentSafeDubinsEnv
+    from lerobot_latentsafe.evaluation.shielding import compare
+
+    policy = LatentSafePolicy.from_pretrained("dubins")
+    policy.attach("dubins_diffusion_reckless")
+    result = compare(policy, LatentSafeDubinsEnv(), 12, seed=500)
+    assert result["bare"]["violation"]["k"] >= 3  # it is reckless
+    assert result["shielded"]["violation"]["k"] < result["bare"]["violation"]["k"]

@@ -1,0 +1,279 @@
+import math
+
+import pytest
+import tiny
+import torch
+
+from lerobot_latentsafe.filter import Reason
+from lerobot_latentsafe.shield import Shield
+from lerobot_latentsafe.world_models import Clip
+
+IMAGE = "observation.image"
+STATES = ((-0.9, 0.1, 0.0), (-0.7, -0.3, 0.5), (0.6, 0.6, 2.0))
+LEFT, STRAIGHT, RIGHT = ([rate, 1.0] for rate in (1.25, 0.0, -1.25))
+
+
+def along(n_steps):
+    """Observations of three cars along a way."""
+    x = torch.tensor(STATES)
+    return [tiny.observation((x + t * torch.tensor([0.05, 0.02, 0.1])).numpy()) for t in range(n_steps)]
+
+
+def actions(*rows):
+    return torch.tensor(rows if len(rows) == 3 else rows * 3)
+
+
+@pytest.fixture
+def permissive(policy):
+    """Passes whatever is not faulty."""
+    policy.config.epsilon = -math.inf
+    return policy
+
+
+@pytest.fixture
+def strict(policy):
+    """Passes nothing."""
+    policy.config.epsilon = math.inf
+    return policy
+
+
+def encode(policy, observations, taken):
+    """The world model's latent after a clip of observations, with the actions that led to each."""
+    images = torch.stack([policy.model_images(o[IMAGE]) for o in observations], 1)
+    state = torch.stack([policy.normalise_state(o["observation.state"]) for o in observations], 1)
+    action = policy.normalise_action(torch.stack(taken, 1))
+    is_first = torch.zeros(state.shape[:2], dtype=torch.bool)
+    is_first[:, 0] = True
+    action = torch.cat([torch.zeros_like(action[:, :1]), action], 1)
+    none = torch.zeros_like(is_first, dtype=torch.long)
+    with torch.no_grad():
+        latents = policy.world_model.encode(Clip({IMAGE: images}, state, action, is_first, ~is_first, none, none))
+    return {key: value[:, -1] for key, value in latents.items()}
+
+
+def assert_same(latent, other):
+    for key in latent:
+        torch.testing.assert_close(latent[key], other[key])
+
+
+# -- history ---
+
+
+def test_history_is_the_world_models_encoding_of_the_clip(permissive):
+    observations, taken = along(4), [actions(LEFT), actions(STRAIGHT), actions(LEFT, RIGHT, STRAIGHT)]
+    for observation, action in zip(observations, [*taken, actions(STRAIGHT)]):
+        decision = permissive.shield(observation, action)
+        assert not decision.intervened.any()
+    assert_same(permissive.shield.latent, encode(permissive, observations, taken))
+
+
+def test_executed_actions_enter_the_history_not_proposed_ones(strict):
+    observations, taken = along(3), []
+    for observation in observations:
+        decision = strict.shield(observation, actions([0.3, 1.0]))
+        assert decision.intervened.all()
+        taken.append(decision.action)
+    assert_same(strict.shield.latent, encode(strict, observations, taken[:-1]))
+    proposed = [actions([0.3, 1.0])] * 2
+    assert not torch.allclose(strict.shield.latent["h"], encode(strict, observations, proposed)["h"])
+
+
+def test_value_is_that_of_the_next_latent_under_the_proposed_action(permissive):
+    observation = along(1)[0]
+    decision = permissive.shield(observation, actions(LEFT))
+    model, latent = permissive.world_model, permissive.shield.latent
+    with torch.no_grad():
+        after = permissive.value(model.step(latent, permissive.normalise_action(actions(LEFT))))
+        now = permissive.margin.bounded(model.features(latent))
+    torch.testing.assert_close(decision.value, torch.minimum(after, now))
+    torch.testing.assert_close(decision.margin, now)
+
+
+def test_reset_forgets(permissive):
+    first = permissive.shield(along(1)[0], actions(LEFT)).value
+    assert not torch.allclose(permissive.shield(along(2)[1], actions(LEFT)).value, first)
+    permissive.shield.reset()
+    torch.testing.assert_close(permissive.shield(along(1)[0], actions(LEFT)).value, first)
+
+
+def test_batch_that_changes_size_within_an_episode_is_refused(permissive):
+    permissive.shield(along(1)[0], actions(LEFT))
+    two = {key: value[:2] for key, value in along(1)[0].items()}
+    with pytest.raises(ValueError, match=r"reset\(\)"):
+        permissive.shield(two, actions(LEFT)[:2])
+    permissive.shield.reset()
+    permissive.shield(two, actions(LEFT)[:2])
+
+
+# -- faults of the observation ---
+
+
+@pytest.mark.parametrize("key", [IMAGE, "observation.state"])
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_an_observation_that_is_not_finite_falls_back_and_says_why(permissive, key, bad):
+    observation = along(1)[0]
+    observation[key][1, 0] = bad
+    decision = permissive.shield(observation, actions(LEFT))
+    assert decision.reason.tolist() == [Reason.PASSED, Reason.OBSERVATION_NOT_FINITE, Reason.PASSED]
+    assert decision.intervened.tolist() == [False, True, False]
+    assert decision.action.isfinite().all() and decision.value.isfinite().all()
+
+
+def test_blind_steps_go_on_by_imagination_and_sight_recovers(permissive):
+    observations = along(4)
+    permissive.shield(observations[0], actions(LEFT))
+    before = {key: value.clone() for key, value in permissive.shield.latent.items()}
+    observations[1][IMAGE][:] = math.nan
+    permissive.shield(observations[1], actions(LEFT))
+    with torch.no_grad():
+        imagined = permissive.world_model.step(before, permissive.normalise_action(actions(LEFT)))
+    assert_same(permissive.shield.latent, imagined)
+    for observation in observations[2:]:
+        decision = permissive.shield(observation, actions(LEFT))
+        assert decision.reason.eq(Reason.PASSED).all()
+
+
+def test_blind_rows_do_not_disturb_the_others(permissive):
+    observations = along(3)
+    for observation in observations:
+        clean = permissive.shield(observation, actions(LEFT))
+    permissive.shield.reset()
+    for t, observation in enumerate(observations):
+        if t == 1:
+            observation["observation.state"][1] = math.nan
+        disturbed = permissive.shield(observation, actions(LEFT))
+    torch.testing.assert_close(disturbed.value[[0, 2]], clean.value[[0, 2]])
+    assert not torch.allclose(disturbed.value[1], clean.value[1])
+
+
+@pytest.mark.parametrize("missing", [IMAGE, "observation.state"])
+def test_missing_key_is_named_with_what_there_is(permissive, missing):
+    observation = along(1)[0]
+    observation["observation.images.other"] = observation.pop(missing)
+    with pytest.raises(KeyError, match=rf"lacks {missing}.*observation\.images\.other.*rename_map"):
+        permissive.shield(observation, actions(LEFT))
+
+
+@pytest.mark.parametrize("level", [0.0, 0.5, 1.0])
+def test_covered_camera_is_missing(permissive, level):
+    observation = along(1)[0]
+    observation[IMAGE][2] = level
+    decision = permissive.shield(observation, actions(LEFT))
+    assert decision.reason.tolist() == [0, 0, Reason.OBSERVATION_MISSING]
+
+
+def test_image_in_bytes_is_not_taken_for_one_in_0_to_1(permissive):
+    observation = along(1)[0]
+    observation[IMAGE] = observation[IMAGE] * 255
+    assert permissive.shield(observation, actions(LEFT)).intervened.all()
+
+
+@pytest.mark.parametrize(
+    ("age_s", "stale"), [(0.0, False), (0.05, False), (0.051, True), (-0.01, True), (math.nan, True)]
+)
+def test_old_observation_is_stale(permissive, age_s, stale):
+    decision = permissive.shield(along(1)[0], actions(LEFT), age_s=age_s)
+    assert decision.reason.tolist() == [Reason.OBSERVATION_STALE if stale else Reason.PASSED] * 3
+
+
+def test_stale_observation_does_not_enter_the_history(permissive):
+    first, second = along(2)
+    permissive.shield(first, actions(LEFT))
+    before = {key: value.clone() for key, value in permissive.shield.latent.items()}
+    permissive.shield(second, actions(LEFT), age_s=1.0)
+    with torch.no_grad():
+        imagined = permissive.world_model.step(before, permissive.normalise_action(actions(LEFT)))
+    assert_same(permissive.shield.latent, imagined)
+
+
+# -- faults of the action ---
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_action_that_is_not_finite_falls_back(permissive, bad):
+    decision = permissive.shield(along(1)[0], actions(LEFT, [bad, 1.0], LEFT))
+    assert decision.reason.tolist() == [0, Reason.ACTION_NOT_FINITE, 0]
+    assert decision.action.isfinite().all() and permissive.shield.executed.isfinite().all()
+
+
+@pytest.mark.parametrize("bad", [[1.3, 1.0], [-9.0, 1.0], [0.0, 2.0]])
+def test_action_out_of_the_datas_range_falls_back(permissive, bad):
+    decision = permissive.shield(along(1)[0], actions(LEFT, bad, LEFT))
+    assert decision.reason.tolist() == [0, Reason.ACTION_OUT_OF_RANGE, 0]
+
+
+def test_float_error_is_not_out_of_range(permissive):
+    assert permissive.shield(along(1)[0], actions([1.2501, 1.0001])).reason.eq(Reason.PASSED).all()
+
+
+@pytest.mark.parametrize("shape", [(3, 1), (3, 7), (2, 2), (3,)])
+def test_action_of_another_shape_names_both(permissive, shape):
+    with pytest.raises(ValueError, match=r"shape \(.*expected \(3, 2\).*turn_rate.vel, speed.vel"):
+        permissive.shield(along(1)[0], torch.zeros(shape))
+
+
+def test_no_action_at_all_falls_back(permissive):
+    decision = permissive.shield(along(1)[0], None)
+    assert decision.reason.eq(Reason.BASE_POLICY_FAILED).all() and decision.intervened.all()
+
+
+def test_first_fault_is_the_one_reported(permissive):
+    observation = along(1)[0]
+    observation["observation.state"][:] = math.nan
+    decision = permissive.shield(observation, actions([math.nan, 1.0]), age_s=9.0)
+    assert decision.reason.eq(Reason.OBSERVATION_NOT_FINITE).all()
+
+
+# -- time, and when nothing can be known ---
+
+
+@pytest.mark.parametrize(("took_ms", "missed"), [(9, False), (11, True)])
+def test_missed_deadline_falls_back(permissive, took_ms, missed):
+    times = iter([0.0, took_ms / 1e3])
+    permissive.config.deadline_ms = 10
+    permissive.shield = Shield(permissive, clock=lambda: next(times))
+    decision = permissive.shield(along(1)[0], actions(LEFT))
+    assert decision.reason.tolist() == [Reason.DEADLINE_MISSED if missed else Reason.PASSED] * 3
+    assert decision.intervened.tolist() == [missed] * 3
+
+
+def test_fallback_is_the_critics_action_in_robot_units(strict):
+    decision = strict.shield(along(1)[0], actions([0.3, 1.0]))
+    with torch.no_grad():
+        features = strict.world_model.features(strict.shield.latent)
+        expected = strict.denormalise_action(strict.critic.fallback(features))
+    torch.testing.assert_close(decision.action, expected)
+    assert all(action in [*map(tuple, tiny.CANDIDATES)] for action in map(tuple, decision.action.tolist()))
+
+
+def test_continuous_fallback_stays_in_range(tiny_continuous_filter):
+    from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+
+    policy = LatentSafePolicy.from_pretrained(tiny_continuous_filter)
+    policy.config.epsilon = math.inf
+    action = policy.shield(along(1)[0], actions([0.3, 1.0])).action
+    assert action[:, 0].abs().max() <= 1.25
+    torch.testing.assert_close(action[:, 1], torch.ones(3))
+
+
+def test_robot_is_held_when_even_the_latent_is_not_finite(permissive):
+    with torch.no_grad():
+        permissive.world_model.posterior_out.bias.fill_(math.nan)
+    decision = permissive.shield(along(1)[0], actions(LEFT))
+    assert decision.reason.eq(Reason.VALUE_NOT_FINITE).all()
+    torch.testing.assert_close(decision.action, permissive.hold_action(3))
+
+
+def test_hold_is_zero_motion_or_the_nearest_the_range_allows(policy):
+    torch.testing.assert_close(policy.hold_action(2), torch.tensor([[0.0, 1.0]] * 2))  # the speed never varies
+    policy.action_low[:], policy.action_high[:] = torch.tensor([0.2, 1.0]), torch.tensor([0.9, 1.0])
+    torch.testing.assert_close(policy.hold_action(1), torch.tensor([[0.2, 1.0]]))
+
+
+def test_monitor_mode_lets_everything_through_and_reports(strict):
+    strict.config.mode = "monitor"
+    proposed = actions(LEFT, [9.0, 1.0], STRAIGHT)
+    decision = strict.shield(along(1)[0], proposed)
+    torch.testing.assert_close(decision.action, proposed)
+    assert not decision.intervened.any() and decision.unsafe.all()
+    assert decision.reason.tolist() == [Reason.UNSAFE_VALUE, Reason.ACTION_OUT_OF_RANGE, Reason.UNSAFE_VALUE]

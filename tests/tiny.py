@@ -1,0 +1,160 @@
+"""Small things that tests build: configurations, batches, policies."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from lerobot_latentsafe import LatentSafeConfig
+from lerobot_latentsafe.envs import dubins
+from lerobot_latentsafe.reachability import ReachabilityConfig
+from lerobot_latentsafe.world_models import Clip, RSSMConfig
+
+REPO_ID = "me/car"
+ACTION_DIM = 2
+CANDIDATES = [[-1.25, 1.0], [0.0, 1.0], [1.25, 1.0]]
+
+
+def rssm_config(**changes):
+    sizes = dict(deterministic=16, stochastic=4, hidden=16, units=16, state_units=8, clip_length=8)
+    return RSSMConfig(**{**sizes, **changes})
+
+
+def reachability_config(**changes):
+    sizes = dict(
+        critic_hidden=(16,), actor_hidden=(16,), steps=20, pool=512, horizon=4, batch_size=32, refresh=10
+    )  # fmt: skip
+    return ReachabilityConfig(**{**sizes, **changes})
+
+
+def config(**changes):
+    options = dict(
+        world_model=rssm_config(), reachability=reachability_config(), action_candidates=CANDIDATES, device="cpu",
+        push_to_hub=False,
+    )  # fmt: skip
+    return LatentSafeConfig(**{**options, **changes})
+
+
+def metadata(root, repo_id=REPO_ID):
+    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+
+    return LeRobotDatasetMetadata(repo_id, root=root)
+
+
+def altered_dataset(root, copy, fps=None, action_names=None):
+    """Metadata of a copy of a cached dataset, as if recorded with another robot; its cache belongs to it."""
+    from lerobot_latentsafe.datasets.frame_cache import dataset_fingerprint
+
+    shutil.copytree(root, copy)
+    info = json.loads((copy / "meta" / "info.json").read_text())
+    info["fps"] = fps or info["fps"]
+    info["features"]["action"]["names"] = action_names or info["features"]["action"]["names"]
+    (copy / "meta" / "info.json").write_text(json.dumps(info))
+    meta = metadata(copy)
+    rewrite_json(copy / "frame_cache" / "manifest.json", fingerprint=dataset_fingerprint(meta))
+    return meta
+
+
+def new_policy(meta, **changes):
+    """An untrained filter, as lerobot-train would make it."""
+    from lerobot.policies.factory import make_policy
+
+    return make_policy(config(**changes), ds_meta=meta)
+
+
+def train_stage_one(meta, folder, steps=5, **changes):
+    """A few gradient steps on world model and margin, then save as lerobot-train does."""
+    from lerobot_latentsafe.training import save_filter
+
+    torch.manual_seed(0)
+    policy = new_policy(meta, **changes).train()
+    optimizer = torch.optim.Adam(policy.get_optim_params(), 1e-3)
+    for _ in range(steps):
+        loss, _ = policy.forward({"index": torch.randint(meta.total_frames, (16,))})
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    save_filter(policy, Path(folder))
+    return folder
+
+
+def diffusion_config(action_dim=ACTION_DIM, **changes):
+    from lerobot.configs.types import FeatureType, PolicyFeature
+    from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
+
+    options = dict(
+        input_features={
+            "observation.state": PolicyFeature(FeatureType.STATE, (2,)),
+            "observation.environment_state": PolicyFeature(FeatureType.ENV, (2,)),
+        },
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (action_dim,))},
+        horizon=8, n_action_steps=4, down_dims=(16, 32), diffusion_step_embed_dim=16, noise_scheduler_type="DDIM",
+        num_train_timesteps=10, num_inference_steps=2, drop_n_last_frames=0, device="cpu",
+    )  # fmt: skip
+    return DiffusionConfig(**{**options, **changes})
+
+
+def save_diffusion(folder, action_dim=ACTION_DIM):
+    """A DiffusionPolicy with random weights, saved with its processors as lerobot-train saves them."""
+    from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
+    from lerobot.policies.factory import make_pre_post_processors
+
+    torch.manual_seed(1)
+    config = diffusion_config(action_dim)
+    bound = {key: torch.ones(n) for key, n in (("observation.state", 2), ("observation.environment_state", 2))}
+    stats = {key: {"min": -1.1 * one, "max": 1.1 * one} for key, one in bound.items()}
+    one = torch.ones(action_dim)  # the turn rate varies, the speed is constant
+    stats["action"] = {"min": torch.cat([-1.25 * one[:1], one[1:]]), "max": torch.cat([1.25 * one[:1], one[1:]])}
+    DiffusionPolicy(config).save_pretrained(folder)
+    for pipeline in make_pre_post_processors(config, dataset_stats=stats):
+        pipeline.save_pretrained(folder)
+    return folder
+
+
+def observation(states):
+    """LeRobot batch that the car's environment gives in states (N, 3)."""
+    seen = dubins.observe(np.atleast_2d(np.asarray(states, float)), dubins.Renderer())
+    return {
+        "observation.image": torch.from_numpy(seen["image"]).permute(0, 3, 1, 2) / 255.0,
+        "observation.state": torch.from_numpy(seen["heading"]),
+        "observation.environment_state": torch.from_numpy(seen["position"]),
+    }
+
+
+def drive(policy, n_steps=6, start=((-0.9, 0.1, 0.0), (-0.7, -0.3, 0.5))):
+    """Decisions of a policy along an episode whose states do not depend on it."""
+    states = np.asarray(start, float)
+    policy.reset()
+    decisions = []
+    for t in range(n_steps):
+        decisions.append(policy.decide(observation(states)))
+        states = dubins.step(states, np.full(len(states), 0.5 * (-1) ** t))
+    return decisions
+
+
+def executed(decisions):
+    """Actions of decisions: (T, B, A)."""
+    return torch.stack([d.action for d in decisions])
+
+
+def random_clip(batch=3, length=5, size=32, action_dim=ACTION_DIM, state_dim=2, key="observation.image"):
+    """Noise in the shape of a training batch."""
+    is_first = torch.zeros(batch, length, dtype=torch.bool)
+    is_first[:, 0] = True
+    return Clip(
+        images={key: torch.rand(batch, length, 3, size, size)},
+        state=torch.randn(batch, length, state_dim),
+        action=torch.where(is_first[..., None], 0.0, 2 * torch.rand(batch, length, action_dim) - 1),
+        is_first=is_first,
+        valid=torch.ones(batch, length, dtype=torch.bool),
+        failure=torch.randint(2, (batch, length)),
+        terminal=torch.zeros(batch, length, dtype=torch.long),
+    )
+
+
+def rewrite_json(path, **changes):
+    """Set top-level entries of a JSON file."""
+    path = Path(path)
+    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
