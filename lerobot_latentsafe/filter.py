@@ -20,6 +20,7 @@ class Reason(IntEnum):
     ACTION_OUT_OF_RANGE = 7
     DEADLINE_MISSED = 8
     BASE_POLICY_FAILED = 9
+    NO_BASE_POLICY = 10
 
 
 @dataclass

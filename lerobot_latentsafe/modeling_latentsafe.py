@@ -17,7 +17,7 @@ from lerobot_latentsafe.checkpoint import CheckpointError, check_sealed, resolve
 from lerobot_latentsafe.configuration_latentsafe import STAGES, LatentSafeConfig
 from lerobot_latentsafe.datasets.clips import ClipReader
 from lerobot_latentsafe.datasets.frame_cache import to_model_images
-from lerobot_latentsafe.filter import FilterDecision
+from lerobot_latentsafe.filter import FilterDecision, Reason
 from lerobot_latentsafe.margin import FailureMargin, hinge_loss
 from lerobot_latentsafe.reachability import SafetyCritic
 from lerobot_latentsafe.shield import BasePolicy, Shield
@@ -160,8 +160,7 @@ class LatentSafePolicy(PreTrainedPolicy):
         """Like `select_action`, with the whole decision."""
         self.require_stage("reachability")
         if self.base is None:
-            decision = self.shield(batch, None, age_s)
-            return decision
+            return self.shield(batch, None, age_s, without=Reason.NO_BASE_POLICY)
         try:
             proposed = self.base.propose(batch)
         except Exception:

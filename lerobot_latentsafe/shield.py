@@ -45,12 +45,19 @@ class Shield:
         self.decision: FilterDecision | None = None
 
     @torch.no_grad()
-    def __call__(self, observation: dict[str, Tensor], proposed: Tensor | None, age_s: float = 0.0) -> FilterDecision:
+    def __call__(
+        self,
+        observation: dict[str, Tensor],
+        proposed: Tensor | None,
+        age_s: float = 0.0,
+        without: Reason = Reason.BASE_POLICY_FAILED,
+    ) -> FilterDecision:
         """Decide on one proposed action.
 
         Args:
             observation: LeRobot batch: images (B, C, H, W) in [0, 1], observation.state (B, S) in robot units.
-            proposed: (B, A) in robot units, or None if there is none (the base policy failed).
+            proposed: (B, A) in robot units, or None if there is none.
+            without: the reason to give where there is none.
             age_s: how old the observation is, seconds; older than one period of the filter's fps is stale.
 
         Returns:
@@ -59,7 +66,7 @@ class Shield:
         started = self.clock()
         model, config = self.filter, self.filter.config
         images, state, fault = self._check_observation(observation, age_s)
-        fault, proposed, inputs = self._check_action(proposed, fault, len(state))
+        fault, proposed, inputs = self._check_action(proposed, fault, len(state), without)
         latent = self._filter_history(images, state, fault)
         features = model.world_model.features(latent)
         margin = model.margin.bounded(features)
@@ -109,12 +116,14 @@ class Shield:
             fault = _first_fault(fault, torch.ones_like(finite), Reason.OBSERVATION_STALE)
         return images, state.nan_to_num(0.0), fault
 
-    def _check_action(self, proposed: Tensor | None, fault: Tensor, batch_size: int) -> tuple[Tensor, Tensor, Tensor]:
+    def _check_action(
+        self, proposed: Tensor | None, fault: Tensor, batch_size: int, without: Reason
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Faults, the proposal in robot units, and model inputs in [-1, 1]."""
         model = self.filter
         everyone = torch.ones(batch_size, dtype=torch.bool, device=model.device)
         if proposed is None:
-            fault = _first_fault(fault, everyone, Reason.BASE_POLICY_FAILED)
+            fault = _first_fault(fault, everyone, without)
             proposed = model.hold_action(batch_size)
         proposed = proposed.to(model.device, torch.float32)
         expected = (batch_size, len(model.config.action_low))

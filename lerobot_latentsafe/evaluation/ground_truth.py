@@ -26,9 +26,10 @@ def exact_value(
 ) -> np.ndarray:
     """Safety value of any states (N, 3) -> (N,) in m^2, for the discrete-time car.
 
-    The disc is rotation-symmetric, so the best sequence holds one turn rate until the disc is passed; simulating
-    each constant action agrees in sign with a fine grid solution on 99.999% of states (tests check it). With
-    only {0, a_max} the best sequence is still constant or a switch between the two, so switches are searched too.
+    The disc is rotation-symmetric, so the best sequence holds one turn rate until the disc is passed. Simulating each
+    constant action agrees in sign with value iteration on more than 99.9% of the states of a grid (tests check it);
+    where they differ, |V| is below 0.01. With only {0, a_max} the best sequence is constant or one switch between the
+    two, so switches are searched as well.
     """
     states = np.asarray(states, float)
     best = np.full(len(states), -np.inf)
