@@ -116,8 +116,9 @@ class Calibrate:
         from lerobot_latentsafe.calibration import calibrate, episode_values, store
         from lerobot_latentsafe.datasets.clips import ClipReader
         from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, adopt_dataset
-        from lerobot_latentsafe.training import save_filter
+        from lerobot_latentsafe.training import refuse_existing, save_filter
 
+        refuse_existing(self.output_dir)
         policy = LatentSafePolicy.from_pretrained(self.policy.path)
         meta = self.dataset.metadata()
         adopt_dataset(policy.config, meta, meta.stats)
@@ -145,8 +146,9 @@ class Wrap:
 
     def run(self) -> None:
         from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
-        from lerobot_latentsafe.training import save_filter
+        from lerobot_latentsafe.training import refuse_existing, save_filter
 
+        refuse_existing(self.output_dir)
         policy = LatentSafePolicy.from_pretrained(self.policy.path)
         if self.epsilon is not None:
             policy.config.epsilon = self.epsilon

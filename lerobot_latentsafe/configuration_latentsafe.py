@@ -31,6 +31,8 @@ class LatentSafeConfig(PreTrainedConfig):
         stage: how far training has come: untrained, world_model, reachability. Set by the training commands.
         epsilon: the filter intervenes where V of the predicted next latent is at or below this.
         calibration: the evidence epsilon was chosen on; written by `latentsafe calibrate`.
+        lookahead: steps of imagination before the critic's value is read, 0 to 25: V and the fallback are the best of
+            the critic's policy and of holding each action. 0 is the critic alone, and the cheapest.
         mode: `filter` overrides unsafe actions, `monitor` only reports what it would have done.
         deadline_ms: if set, a decision that took longer is not trusted, and the fallback acts.
         base_policy_path: the policy to shield: a folder, a Hub id or the name of a committed checkpoint.
@@ -54,6 +56,7 @@ class LatentSafeConfig(PreTrainedConfig):
 
     epsilon: float = 0.0
     calibration: dict[str, float] = field(default_factory=dict)
+    lookahead: int = 15
     mode: str = "filter"
     deadline_ms: float | None = None
     base_policy_path: str | None = None
@@ -89,6 +92,8 @@ class LatentSafeConfig(PreTrainedConfig):
             raise ValueError(f"stage is {self.stage!r}; expected one of {', '.join(STAGES)}")
         if self.mode not in MODES:
             raise ValueError(f"--policy.mode is {self.mode!r}; expected one of {', '.join(MODES)}")
+        if not 0 <= self.lookahead <= 25:
+            raise ValueError(f"--policy.lookahead is {self.lookahead}; expected 0 (critic alone) to 25 imagined steps")
         if self.margin_delta <= 0:
             raise ValueError(f"--policy.margin_delta is {self.margin_delta}; expected a positive number")
 

@@ -19,7 +19,8 @@ from lerobot_latentsafe.datasets.clips import ClipReader
 from lerobot_latentsafe.datasets.frame_cache import to_model_images
 from lerobot_latentsafe.filter import FilterDecision, Reason
 from lerobot_latentsafe.margin import FailureMargin, hinge_loss
-from lerobot_latentsafe.reachability import SafetyCritic
+from lerobot_latentsafe.memory import keep_freed_memory
+from lerobot_latentsafe.reachability import LatentImagination, SafetyCritic, look_ahead
 from lerobot_latentsafe.shield import BasePolicy, Shield
 from lerobot_latentsafe.world_models.base import Latent
 
@@ -64,6 +65,7 @@ class LatentSafePolicy(PreTrainedPolicy):
         self.critic = SafetyCritic(
             self.world_model.feature_dim, n_actions, candidates, config.reachability, self.action_varies
         )
+        self.imagination = LatentImagination(self.world_model, self.margin)
         self._base: list[BasePolicy] = []  # in a list, so that its weights are not ours
         self.shield = Shield(self)
         if config.base_policy_path:
@@ -106,6 +108,8 @@ class LatentSafePolicy(PreTrainedPolicy):
             raise UntrainedFilterError(
                 "forward needs the dataset's labels: build the policy through lerobot-train or make_policy(ds_meta=...)"
             )
+        if self.device.type == "cpu":
+            keep_freed_memory()
         clip = self.reader.read(batch, self)
         loss, features, metrics = self.world_model.loss(clip)
         margin = self.margin(features)
@@ -118,12 +122,18 @@ class LatentSafePolicy(PreTrainedPolicy):
             self.config.stage = STAGES[1]
         return loss, {**metrics, "loss_margin": margin_loss.item(), "margin_accuracy": correct.item()}
 
-    @torch.no_grad()
     def value(self, latent: Latent) -> Tensor:
-        """V(z) = min(l(z), max_a Q(z, a)) of latents (B, ...) -> (B,)."""
+        """V(z) of latents (B, ...) -> (B,); see `plan`."""
+        return self.plan(latent)[0]
+
+    def plan(self, latent: Latent) -> tuple[Tensor, Tensor]:
+        """The safety value V(z), and the fallback action in [-1, 1]: (B,), (B, A).
+
+        min(l, max_a Q) of the critic, read after `config.lookahead` imagined steps of the best of a few policies.
+        """
         self.require_stage("reachability")
-        features = self.world_model.features(latent)
-        return self.critic.value(features, self.margin.bounded(features))
+        held = self.critic.held_actions()
+        return look_ahead(self.imagination, latent, held, self.config.lookahead, self.critic)
 
     # -- deployment ---
 
@@ -180,12 +190,12 @@ class LatentSafePolicy(PreTrainedPolicy):
     def require_stage(self, stage: str) -> None:
         """Raise unless training has come at least this far."""
         if STAGES.index(self.config.stage) < STAGES.index(stage):
-            command = {
-                "world_model": "lerobot-train --policy.type=latentsafe",
-                "reachability": "latentsafe train-reachability --policy.path=...",
+            part, command = {
+                "world_model": ("world model", "lerobot-train --policy.type=latentsafe"),
+                "reachability": ("safety critic", "latentsafe train-reachability --policy.path=..."),
             }[stage]
             raise UntrainedFilterError(
-                f"this filter's stage is {self.config.stage!r}, {stage!r} is needed: its safety critic was never "
+                f"this filter's stage is {self.config.stage!r}, {stage!r} is needed: its {part} was never "
                 f"trained. Run {command} first"
             )
 

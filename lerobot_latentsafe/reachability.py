@@ -40,12 +40,19 @@ class Imagination(Protocol):
 
 
 class LatentImagination:
-    """A frozen world model and failure margin behind the `Imagination` protocol."""
+    """A world model and failure margin behind the `Imagination` protocol."""
 
     def __init__(self, world_model: WorldModel, margin: FailureMargin):
-        self.world_model = world_model.eval().requires_grad_(False)
-        self.failure_margin = margin.eval().requires_grad_(False)
-        self.step, self.features, self.ended = world_model.step, world_model.features, world_model.ended
+        self.world_model, self.failure_margin = world_model, margin
+
+    def step(self, latent: Latent, action: Tensor) -> Latent:
+        return self.world_model.step(latent, action)
+
+    def features(self, latent: Latent) -> Tensor:
+        return self.world_model.features(latent)
+
+    def ended(self, latent: Latent) -> Tensor:
+        return self.world_model.ended(latent)
 
     def margin(self, latent: Latent) -> Tensor:
         return self.failure_margin.bounded(self.world_model.features(latent))
@@ -66,8 +73,10 @@ class ReachabilityConfig:
     Attributes:
         critic_hidden, actor_hidden: widths of the hidden layers.
         activation: `tanh` or `relu`.
-        horizon: imagined steps before a start is drawn anew (at most 25 in the paper). A short one keeps the pool
-            full of encoded observations, which is where the filter will ask.
+        components: principal components of the features that actor and critic read.
+        horizon: imagined steps before a start is drawn anew (at most 25 in the paper).
+        kept: the first steps of these whose states are learned on; the later ones only say what came of them. That
+            keeps the pool full of encoded observations, which is where the filter will ask.
         steps: gradient steps.
         batch_size: imagined states a gradient step; with discrete actions each is backed up under all of them.
         lr, actor_lr: AdamW step sizes, decayed over the second half.
@@ -83,7 +92,9 @@ class ReachabilityConfig:
     critic_hidden: tuple[int, ...] = (128, 128, 128)
     actor_hidden: tuple[int, ...] = (256, 256)
     activation: str = "relu"
-    horizon: int = 8
+    components: int = 16
+    horizon: int = 25
+    kept: int = 8
     steps: int = 12_000
     batch_size: int = 512
     lr: float = 1e-3
@@ -110,7 +121,7 @@ def _mlp(sizes: list[int], activation: str) -> nn.Sequential:
 
 
 class SafetyCritic(nn.Module):
-    """Q(z, a) and the fallback policy over standardised features, for a discrete or a continuous action space.
+    """Q(z, a) and the fallback policy over projected features, for a discrete or a continuous action space.
 
     Args:
         feature_dim: D.
@@ -128,27 +139,45 @@ class SafetyCritic(nn.Module):
         varies: Tensor | None = None,
     ):
         super().__init__()
+        n_components = min(config.components, feature_dim)
         self.register_buffer("feature_mean", torch.zeros(feature_dim))
-        self.register_buffer("feature_std", torch.ones(feature_dim))
+        self.register_buffer("projection", torch.eye(feature_dim, n_components))
         self.register_buffer("candidates", candidates)
         varies = torch.ones(action_dim) if varies is None else varies.float()
         self.register_buffer("varies", varies, persistent=False)
         self.discrete = candidates is not None
         n_out = len(candidates) if self.discrete else 1
-        n_in = feature_dim + (0 if self.discrete else action_dim)
+        n_in = n_components + (0 if self.discrete else action_dim)
         self.q = _mlp([n_in, *config.critic_hidden, n_out], config.activation)
-        self.actor = None if self.discrete else _mlp([feature_dim, *config.actor_hidden, action_dim], config.activation)
+        self.actor = (
+            None if self.discrete else _mlp([n_components, *config.actor_hidden, action_dim], config.activation)
+        )
 
-    def set_feature_scale(self, features: Tensor) -> None:
-        """Standardise by these features (N, D)."""
+    def set_projection(self, features: Tensor) -> None:
+        """Read the leading principal components of these features (N, D), all on one scale.
+
+        A world model's latent holds far more numbers than the state has degrees of freedom. A critic of all of them,
+        each blown up to unit variance, fits its training states and errs on new ones.
+        """
         self.feature_mean.copy_(features.mean(0))
-        self.feature_std.copy_(features.std(0) + 1e-2)
+        _, spread, axes = torch.linalg.svd(features - self.feature_mean, full_matrices=False)
+        kept = self.projection.shape[1]
+        scale = spread[:kept].square().mean().sqrt() / len(features) ** 0.5
+        self.projection.copy_(axes[:kept].T / scale.clamp(min=1e-6))
 
-    def standardise(self, features: Tensor) -> Tensor:
-        return (features - self.feature_mean) / self.feature_std
+    def project(self, features: Tensor) -> Tensor:
+        """Features (..., D) -> what q and actor read (..., C)."""
+        return (features - self.feature_mean) @ self.projection
+
+    def held_actions(self) -> Tensor:
+        """(K, A) actions worth holding: the candidates, or standing still and the extremes of each command."""
+        if self.discrete:
+            return self.candidates
+        each = torch.diag(self.varies)[self.varies > 0]
+        return torch.cat([torch.zeros_like(each[:1]), each, -each])
 
     def best_q(self, x: Tensor) -> Tensor:
-        """max_a Q over standardised features (..., D) -> (...,)."""
+        """max_a Q over projected features (..., D) -> (...,)."""
         return self.q(x).amax(-1) if self.discrete else self.q_of(x, self.act(x))
 
     def q_of(self, x: Tensor, action: Tensor) -> Tensor:
@@ -163,11 +192,51 @@ class SafetyCritic(nn.Module):
 
     def value(self, features: Tensor, margin: Tensor) -> Tensor:
         """V = min(l, max_a Q) at raw features (..., D) with bounded margin (...,)."""
-        return torch.minimum(margin, self.best_q(self.standardise(features)))
+        return torch.minimum(margin, self.best_q(self.project(features)))
 
     def fallback(self, features: Tensor) -> Tensor:
         """Safety-preserving action in [-1, 1] at raw features: (..., D) -> (..., A)."""
-        return self.act(self.standardise(features))
+        return self.act(self.project(features))
+
+
+@torch.no_grad()
+def look_ahead(
+    imagination: Imagination, latent: Latent, held: Tensor, horizon: int, critic: SafetyCritic | None = None
+) -> tuple[Tensor, Tensor]:
+    """V by imagining what could be done from here: the best of a few policies, each followed for `horizon` steps.
+
+    The policies hold one action each; given a critic, its fallback policy is one more, and its value stands for all
+    that comes after the horizon. Each outcome is a lower bound of V in the imagined world, up to the error of that
+    last value. With horizon 0 and a critic this is min(l, max_a Q).
+
+    Args:
+        latent: N latents.
+        held: (K, A) actions in [-1, 1].
+
+    Returns:
+        V (N,), and the first action of the best policy (N, A).
+    """
+    if horizon == 0 and critic is not None:
+        features = imagination.features(latent)
+        return critic.value(features, imagination.margin(latent)), critic.fallback(features)
+    now = imagination.margin(latent)
+    n, n_policies = len(now), len(held) + (critic is not None)
+    z = map_latent(latent, lambda t: t.repeat(n_policies, *[1] * (t.dim() - 1)))
+    worst, over = now.repeat(n_policies), torch.zeros(n * n_policies, dtype=torch.bool, device=now.device)
+    action = first = held.repeat_interleave(n, 0)
+    for t in range(horizon):
+        if critic is not None:
+            follower = map_latent(z, lambda x: x[len(held) * n :])
+            action = torch.cat([action[: len(held) * n], critic.fallback(imagination.features(follower))])
+        first = action if t == 0 else first
+        z = imagination.step(z, action)
+        worst = torch.where(over, worst, torch.minimum(worst, imagination.margin(z)))
+        over = over | imagination.ended(z)
+    if critic is not None:
+        after = critic.value(imagination.features(z), imagination.margin(z))
+        worst = torch.where(over, worst, torch.minimum(worst, after))
+    best = worst.view(n_policies, n).max(0)
+    return best.values, first.view(n_policies, n, -1)[best.indices, torch.arange(n, device=now.device)]
 
 
 def discount(progress: float, config: ReachabilityConfig) -> float:
@@ -199,7 +268,8 @@ class LatentReachability:
         fused = critic.feature_mean.device.type in ("cpu", "cuda")
         self.optimizer = torch.optim.AdamW(groups, weight_decay=0.0, fused=fused)
         self.step_count = 0
-        self.chunk = max(1, min(2048, config.pool // config.horizon))
+        self.kept = min(config.kept, config.horizon)
+        self.chunk = max(1, min(2048, config.pool // self.kept))
         self.pool: dict[str, Tensor] = {}
         self._fill_pool()
 
@@ -207,11 +277,11 @@ class LatentReachability:
 
     @torch.no_grad()
     def imagine(self) -> dict[str, Tensor]:
-        """Roll `chunk` starts out for `horizon` steps.
+        """Roll `chunk` starts out for `horizon` steps and keep the first `kept` of them.
 
         Returns:
-            x (N, D) features and the action taken (N, A); next_x (N, K, D), next_l and ended (N, K), where the K
-            successors are those of all candidates, of which `choice` (N,) was taken, or the only one when actions
+            x (N, C) projected features and the action taken (N, A); next_x (N, K, C), next_l and ended (N, K), where
+            the K successors are those of all candidates, of which `choice` (N,) was taken, or the only one when actions
             are continuous; and what `_add_outcomes` says of the rest of the trajectory.
         """
         critic, config, n = self.critic, self.config, self.chunk
@@ -219,12 +289,15 @@ class LatentReachability:
         greedy = self._rand(n) < config.greedy
         held = self._random_actions(n)
         rows: list[dict[str, Tensor]] = []
-        for _ in range(config.horizon):
+        for t in range(config.horizon):
             features = self.imagination.features(latent)
-            x = critic.standardise(features)
+            x = critic.project(features)
             held = torch.where((self._rand(n) < config.switch)[:, None], self._random_actions(n), held)
             action, choice = self._explore(x, greedy, held)
-            tried = critic.candidates.unsqueeze(0).expand(n, -1, -1) if critic.discrete else action[:, None]
+            if critic.discrete and t < self.kept:
+                tried = critic.candidates.unsqueeze(0).expand(n, -1, -1)
+            else:
+                tried, choice = action[:, None], torch.zeros_like(choice)
             k = tried.shape[1]
             repeated = map_latent(latent, lambda t, k=k: t.repeat_interleave(k, 0))
             after = self.imagination.step(repeated, tried.flatten(0, 1))
@@ -234,7 +307,7 @@ class LatentReachability:
                     "x": x,
                     "action": action,
                     "choice": choice,
-                    "next_x": critic.standardise(next_features).unflatten(0, (n, k)),
+                    "next_x": critic.project(next_features).unflatten(0, (n, k)),
                     "next_l": self.imagination.margin(after).unflatten(0, (n, k)),
                     "ended": ended.unflatten(0, (n, k)),
                 }
@@ -244,13 +317,13 @@ class LatentReachability:
             if ended[taken].any():
                 latent = replace_rows(latent, self.starts(n), where=ended[taken])
         self._add_outcomes(rows)
-        return {key: torch.cat([row[key] for row in rows]) for key in rows[0]}
+        return {key: torch.cat([row[key] for row in rows[: self.kept]]) for key in rows[0]}
 
     @staticmethod
     def _add_outcomes(rows: list[dict[str, Tensor]]) -> None:
         """What came of each action taken: the worst margin until the trajectory's end, and the latent it ended in.
 
-        Adds worst (N,), end_x (N, D) and end_over (N,): whether the episode was over there.
+        Adds worst (N,), end_x (N, C) and end_over (N,): whether the episode was over there.
         """
         later: dict[str, Tensor] | None = None
         for row in reversed(rows):
@@ -287,9 +360,9 @@ class LatentReachability:
 
     @torch.no_grad()
     def _fill_pool(self) -> None:
-        self.critic.set_feature_scale(self.imagination.features(self.starts(4096)))
+        self.critic.set_projection(self.imagination.features(self.starts(4096)))
         self.target.load_state_dict(self.critic.state_dict())
-        n_chunks = max(1, self.config.pool // (self.chunk * self.config.horizon))
+        n_chunks = max(1, self.config.pool // (self.chunk * self.kept))
         chunks = [self.imagine() for _ in range(n_chunks)]
         self.pool = {key: torch.cat([c[key] for c in chunks]) for key in chunks[0]}
         self._oldest = 0

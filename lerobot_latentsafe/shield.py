@@ -68,12 +68,11 @@ class Shield:
         images, state, fault = self._check_observation(observation, age_s)
         fault, proposed, inputs = self._check_action(proposed, fault, len(state), without)
         latent = self._filter_history(images, state, fault)
-        features = model.world_model.features(latent)
-        margin = model.margin.bounded(features)
-        fallback = self._fallback(features)
+        margin = model.imagination.margin(latent)
         predicted = model.world_model.step(latent, inputs)
-        next_features = model.world_model.features(predicted)
-        value = model.critic.value(next_features, model.margin.bounded(next_features))
+        both = {key: torch.cat([predicted[key], latent[key]]) for key in latent}  # one pass through imagination
+        (value, here), (_, action) = (part.split(len(state)) for part in model.plan(both))
+        fallback = self._usable(action, here)
         # A margin that is negative now is a failure whatever comes after.
         value = torch.minimum(value, margin)
         if config.deadline_ms is not None and (self.clock() - started) * 1e3 > config.deadline_ms:
@@ -157,12 +156,11 @@ class Shield:
         blind = (fault >= Reason.OBSERVATION_NOT_FINITE) & (fault <= Reason.OBSERVATION_STALE)
         return replace_rows(seen, predicted, where=blind)
 
-    def _fallback(self, features: Tensor) -> Tensor:
-        """The safety policy's action in robot units; where even that is not finite, hold."""
+    def _usable(self, action: Tensor, value: Tensor) -> Tensor:
+        """The safety policy's action in robot units; where it or its value is not finite, hold."""
         model = self.filter
-        action = model.denormalise_action(model.critic.fallback(features))
-        usable = torch.isfinite(action).all(-1) & torch.isfinite(features).all(-1)
-        return torch.where(usable[:, None], action, model.hold_action(len(features)))
+        finite = torch.isfinite(action).all(-1) & torch.isfinite(value)
+        return torch.where(finite[:, None], model.denormalise_action(action), model.hold_action(len(action)))
 
 
 def _first_fault(fault: Tensor, where: Tensor, reason: Reason) -> Tensor:
@@ -194,9 +192,11 @@ class BasePolicy:
         config.device = device
         self.config = config
         try:
-            self.policy = get_policy_class(config.type).from_pretrained(self.path, config=config)
-        except SafetensorError as e:
-            raise CheckpointError(f"base policy {self.path} has unreadable weights ({e}); copy it again") from e
+            self.policy = get_policy_class(config.type).from_pretrained(self.path, config=config, strict=True)
+        except (SafetensorError, RuntimeError) as e:
+            raise CheckpointError(
+                f"base policy {self.path}: weights unreadable or not its own ({e}); copy it again"
+            ) from e
         self.preprocessor, self.postprocessor = make_pre_post_processors(
             config, pretrained_path=self.path, preprocessor_overrides={"device_processor": {"device": device}}
         )

@@ -64,8 +64,7 @@ def train_reachability(
     """
     from tqdm import trange
 
-    if (Path(output_dir) / "config.json").exists():
-        raise FileExistsError(f"{output_dir} holds a checkpoint already; choose another --output_dir")
+    refuse_existing(output_dir)
     torch.manual_seed(seed)
     policy = LatentSafePolicy.from_pretrained(path)
     policy.require_stage("world_model")
@@ -95,6 +94,12 @@ def train_reachability(
     save_filter(policy, output_dir)
     print(f"reachability: {time.process_time() - started:.0f} CPU-s")
     return policy
+
+
+def refuse_existing(output_dir: str | Path) -> None:
+    """Raise FileExistsError if a checkpoint would be overwritten; called before any work is done."""
+    if (Path(output_dir) / "config.json").exists():
+        raise FileExistsError(f"{output_dir} holds a checkpoint already; choose another --output_dir")
 
 
 def save_filter(policy: LatentSafePolicy, output_dir: Path, half: bool = False) -> None:

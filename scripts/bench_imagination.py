@@ -98,7 +98,7 @@ def our_learner(policy: LatentSafePolicy, seed: int) -> tuple[LatentReachability
 def rollouts_of_a_run(learner: LatentReachability) -> int:
     """How often a training of the configured length calls `imagine`: to fill the pool, and to renew parts of it."""
     config = learner.config
-    return max(1, config.pool // (learner.chunk * config.horizon)) + (config.steps - 1) // config.refresh
+    return max(1, config.pool // (learner.chunk * learner.kept)) + (config.steps - 1) // config.refresh
 
 
 def timed(function: Callable) -> tuple[object, float]:
@@ -141,10 +141,11 @@ def main() -> None:
                 rows, seconds = timed(learner.imagine)
                 (n, k), calls = rows["next_l"].shape, rollouts_of_a_run(learner)
                 whole_run = calls * seconds + ENCODED_FRAMES * encoding[name]
-                total[name] = calls * n * k
-                note(f"{name}_imagine", n * k / seconds)
-                note(f"{name}_with_resets", calls * n * k / whole_run)
-                note(f"{name}_along_trajectories_with_resets", calls * n / whole_run)
+                tail = learner.chunk * (learner.config.horizon - learner.kept)  # one action a step, not all
+                total[name] = calls * (n * k + tail)
+                note(f"{name}_imagine", (n * k + tail) / seconds)
+                note(f"{name}_with_resets", total[name] / whole_run)
+                note(f"{name}_along_trajectories_with_resets", calls * (n + tail) / whole_run)
             print(f"round {i} of {args.repeats}", flush=True)
     rate = {name: values[1:] for name, values in rate.items()}  # the first round warms up
 

@@ -3,8 +3,9 @@
 
     scripts/dubins_table1.py --filters outputs/dubins/filter_0 outputs/dubins/filter_1 --seeds 0 1 2
 
-Rows: the latent filters, the privileged baseline (trained here, one critic a seed), and three that keep them honest:
-the failure classifier alone, a planner that imagines constant actions with the same world model, always safe.
+Rows: the latent filters as they are used, their critics alone (lookahead 0), the privileged baseline (trained here, one
+critic a seed), and three that keep them honest: a planner that only imagines held actions with the same world models,
+the failure classifier alone, always safe.
 """
 
 import argparse
@@ -65,15 +66,19 @@ def main() -> None:
     states = grid_states()
     truths = {"discrete": exact_value(states), "continuous": solve_continuous().reshape(-1)}
     table: dict[str, dict] = {}
-    latent_rows, plan_rows, classifier_rows = [], [], []
+    latent_rows, critic_rows, plan_rows, classifier_rows = [], [], [], []
     for path in arguments.filters:
-        monitor = LatentMonitor(LatentSafePolicy.from_pretrained(path))
+        policy = LatentSafePolicy.from_pretrained(path)
+        monitor = LatentMonitor(policy)
+        lookahead, policy.config.lookahead = policy.config.lookahead, 0
+        critic_rows.append({**score(monitor.value(states), truths), **rollouts(monitor)})
+        policy.config.lookahead = lookahead
         latent_rows.append({**score(monitor.value(states), truths), **rollouts(monitor)})
-        if not plan_rows:  # a planner has nothing to learn: one world model and every fifth state will do
-            value = PlanMonitor(monitor).value(states[::5])
-            plan_rows.append(score(value, {name: true[::5] for name, true in truths.items()}))
+        value = PlanMonitor(monitor).value(states[::5])  # every fifth state will do for a control
+        plan_rows.append(score(value, {name: true[::5] for name, true in truths.items()}))
         classifier_rows.append(score(monitor.margin(states), truths))
-        print(path, {k: round(v, 4) for k, v in latent_rows[-1]["continuous"].items()}, flush=True)
+        for name, rows in (("latent", latent_rows), ("critic alone", critic_rows), ("plan", plan_rows)):
+            print(path, name, {k: round(v, 4) for k, v in rows[-1]["continuous"].items()}, flush=True)
 
     privileged_rows, cpu = [], []
     for seed in arguments.seeds:
@@ -83,7 +88,11 @@ def main() -> None:
         privileged_rows.append({**score(privileged.value(states), truths), **rollouts(privileged)})
         print("privileged", seed, {k: round(v, 4) for k, v in privileged_rows[-1]["continuous"].items()}, flush=True)
 
-    for name, rows in (("latent", latent_rows), ("privileged", privileged_rows)):
+    for name, rows in (
+        ("latent", latent_rows),
+        ("critic_alone", critic_rows),
+        ("privileged", privileged_rows),
+    ):
         table[name] = {"seeds": rows, "summary": summary(rows)}
     table["plan"] = {"seeds": plan_rows}
     table["failure_classifier_alone"] = {"seeds": classifier_rows}

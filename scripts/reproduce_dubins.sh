@@ -54,7 +54,7 @@ data random_continuous 2000
 filter continuous random_continuous 0 null
 
 data reckless 100
-data careful 100
+data careful 200
 diffusion reckless
 diffusion careful
 for seed in 0 1 2; do

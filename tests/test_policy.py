@@ -268,6 +268,7 @@ def test_units_round_trip(policy):
 
 
 def test_alone_it_is_the_fallback_policy(policy):
+    policy.config.lookahead = 0
     batch = tiny.observation([[-0.9, 0.0, 0.0], [0.2, 0.9, 1.0]])
     action = policy.select_action(batch)
     with torch.no_grad():
@@ -275,6 +276,12 @@ def test_alone_it_is_the_fallback_policy(policy):
     torch.testing.assert_close(action, policy.denormalise_action(expected))
     policy.reset()
     assert policy.predict_action_chunk(batch).shape == (2, 1, 2)
+
+
+def test_lookahead_outside_of_what_imagination_can_is_refused():
+    for steps in (-1, 26):
+        with pytest.raises(ValueError, match=rf"lookahead is {steps}; expected 0"):
+            tiny.config(lookahead=steps)
 
 
 def test_epsilon_above_everything_always_overrides(shielded):

@@ -1,3 +1,4 @@
+import math
 from itertools import pairwise
 
 import numpy as np
@@ -15,6 +16,7 @@ from lerobot_latentsafe.reachability import (
     ReachabilityConfig,
     SafetyCritic,
     discount,
+    look_ahead,
     safety_bellman_target,
 )
 
@@ -148,12 +150,64 @@ def test_equal_seeds_learn_equal_critics(candidates):
 def test_q_is_the_value_after_the_action():
     learner = small_learner(WindyChain(), torch.tensor([[-1.0], [1.0]]))
     pool = learner.pool
-    x = pool["x"] * learner.critic.feature_std + learner.critic.feature_mean
+    x = pool["x"] / learner.critic.projection + learner.critic.feature_mean  # one feature, one component
     for k, action in enumerate((-1.0, 1.0)):
         after = WindyChain().step({"x": x}, torch.full_like(x, action))["x"]
         torch.testing.assert_close(pool["next_l"][:, k], after.squeeze(-1))
     target = learner._td_target(pool, 0.0)  # gamma 0: Q(z, a) = l(z')
     torch.testing.assert_close(target, pool["next_l"])
+
+
+def untrained_critic(bias=0.0):
+    critic = SafetyCritic(1, 1, torch.tensor([[-1.0], [1.0]]), ReachabilityConfig(critic_hidden=(8,)))
+    with torch.no_grad():
+        critic.q[-1].weight.zero_()
+        critic.q[-1].bias.fill_(bias)
+    return critic
+
+
+def test_look_ahead_finds_the_exact_safe_set_without_a_trained_critic():
+    x = torch.linspace(-0.9, 0.9, 37)[:, None]
+    value, action = look_ahead(WindyChain(), {"x": x}, torch.tensor([[-1.0], [1.0]]), 20)
+    assert torch.equal(value > 0, x[:, 0] >= WindyChain.threshold)
+    assert (action[value > 0] == 1).all()
+
+
+def test_look_ahead_of_nothing_is_the_critic():
+    critic, latent = untrained_critic(0.3), {"x": torch.linspace(-0.9, 0.9, 7)[:, None]}
+    value, action = look_ahead(WindyChain(), latent, critic.held_actions(), 0, critic)
+    torch.testing.assert_close(value, latent["x"][:, 0].clamp(max=0.3))
+    torch.testing.assert_close(action, critic.fallback(latent["x"]))
+
+
+@pytest.mark.parametrize(("bias", "safe"), [(0.9, True), (-0.9, False)])
+def test_look_ahead_leaves_what_comes_after_to_the_critic(bias, safe):
+    latent = {"x": torch.tensor([[0.8]])}
+    critic = untrained_critic(bias)
+    value, _ = look_ahead(WindyChain(), latent, critic.held_actions(), 2, critic)
+    assert (value > 0).item() == safe
+
+
+def test_look_ahead_keeps_what_is_not_finite():
+    value, _ = look_ahead(WindyChain(), {"x": torch.tensor([[math.nan], [0.8]])}, torch.tensor([[-1.0], [1.0]]), 3)
+    assert value.isnan().tolist() == [True, False]
+
+
+def test_held_actions_move_only_what_varies():
+    config = ReachabilityConfig(critic_hidden=(8,), actor_hidden=(8,))
+    critic = SafetyCritic(4, 3, None, config, torch.tensor([True, False, True]))
+    assert critic.held_actions().tolist() == [[0, 0, 0], [1, 0, 0], [0, 0, 1], [-1, 0, 0], [0, 0, -1]]
+
+
+def test_critic_reads_principal_components_on_one_scale():
+    torch.manual_seed(0)
+    features = torch.randn(500, 6) * torch.tensor([10.0, 5.0, 1e-3, 1e-3, 1e-3, 1e-3]) + 7
+    critic = SafetyCritic(6, 1, torch.tensor([[-1.0], [1.0]]), ReachabilityConfig(components=3))
+    critic.set_projection(features)
+    x = critic.project(features)
+    assert x.shape == (500, 3) and x.mean(0).abs().max() < 1e-4
+    assert x[:, 0].std() > 1.5 * x[:, 1].std() > 1000 * x[:, 2].std()  # noise is not blown up
+    torch.testing.assert_close(x.square().mean(), torch.tensor(1.0), rtol=0.02, atol=0.0)
 
 
 def test_what_has_ended_cannot_fail_any_more():

@@ -237,11 +237,16 @@ def test_missed_deadline_falls_back(permissive, took_ms, missed):
     assert decision.intervened.tolist() == [missed] * 3
 
 
-def test_fallback_is_the_critics_action_in_robot_units(strict):
+@pytest.mark.parametrize("lookahead", [0, 3])
+def test_fallback_is_the_plans_first_action_in_robot_units(strict, lookahead):
+    strict.config.lookahead = lookahead
     decision = strict.shield(along(1)[0], actions([0.3, 1.0]))
     with torch.no_grad():
-        features = strict.world_model.features(strict.shield.latent)
-        expected = strict.denormalise_action(strict.critic.fallback(features))
+        latent = strict.shield.latent
+        expected = strict.denormalise_action(strict.plan(latent)[1])
+        if not lookahead:
+            critics = strict.critic.fallback(strict.world_model.features(latent))
+            torch.testing.assert_close(expected, strict.denormalise_action(critics))
     torch.testing.assert_close(decision.action, expected)
     assert all(action in [*map(tuple, tiny.CANDIDATES)] for action in map(tuple, decision.action.tolist()))
 

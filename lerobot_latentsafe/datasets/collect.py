@@ -70,7 +70,7 @@ def reckless_driver(state: np.ndarray) -> float:
     return _steer(state, np.array([1.2, 0.0]))
 
 
-def careful_driver(state: np.ndarray, min_value: float = 0.12) -> float:
+def careful_driver(state: np.ndarray, min_value: float = 0.25) -> float:
     """Heads for the goal unless that would leave less than `min_value` of safety; then turns away in good time."""
     wanted = _steer(state, np.array([1.2, 0.0]))
     choices = np.array([wanted, *dubins.TURN_RATES])

@@ -11,7 +11,7 @@ from lerobot_latentsafe.envs import dubins
 from lerobot_latentsafe.evaluation.ground_truth import exact_value
 from lerobot_latentsafe.evaluation.rollouts import confusion
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
-from lerobot_latentsafe.reachability import SafetyCritic
+from lerobot_latentsafe.reachability import SafetyCritic, look_ahead
 
 
 class Monitor(Protocol):
@@ -67,15 +67,19 @@ class LatentMonitor:
         return self.policy.world_model.observe(latent, straight.expand(len(states), -1), *self._see(states))
 
     def start(self) -> Callable[[np.ndarray], np.ndarray]:
+        return self.drive(lambda latent: self.policy.plan(latent)[1])
+
+    def drive(self, choose: Callable[[dict[str, Tensor]], Tensor]) -> Callable[[np.ndarray], np.ndarray]:
+        """A driver that filters every frame it sees and takes the action (N, A) chosen for the latent."""
         policy = self.policy
-        memory: dict = {"latent": None, "action": None}
+        latent, action = None, None
 
         @torch.no_grad()
         def act(states: np.ndarray) -> np.ndarray:
-            latent = policy.world_model.observe(memory["latent"], memory["action"], *self._see(states))
-            memory["latent"] = latent
-            memory["action"] = policy.critic.fallback(policy.world_model.features(latent))
-            return policy.denormalise_action(memory["action"]).cpu().numpy()[:, 0]
+            nonlocal latent, action
+            latent = policy.world_model.observe(latent, action, *self._see(states))
+            action = choose(latent)
+            return policy.denormalise_action(action).cpu().numpy()[:, 0]
 
         return act
 
@@ -107,7 +111,7 @@ class PrivilegedMonitor:
 
 
 class PlanMonitor:
-    """No reachability learning at all: imagine each constant action for `horizon` steps, keep the best worst margin.
+    """No reachability learning at all: imagine each held action for `horizon` steps, keep the best worst margin.
 
     What a simple planner makes of the same world model and margin; a row that keeps the learned value honest.
     """
@@ -115,39 +119,17 @@ class PlanMonitor:
     def __init__(self, latent: LatentMonitor, horizon: int = 25):
         self.latent_monitor, self.horizon = latent, horizon
 
-    @torch.no_grad()
     def value(self, states: np.ndarray) -> np.ndarray:
         monitor, size = self.latent_monitor, self.latent_monitor.chunk
         parts = [self._plan(monitor.latent(states[i : i + size]))[0] for i in range(0, len(states), size)]
         return torch.cat(parts).cpu().numpy()
 
     def start(self) -> Callable[[np.ndarray], np.ndarray]:
-        monitor, policy = self.latent_monitor, self.latent_monitor.policy
-        memory: dict = {"latent": None, "action": None}
-
-        @torch.no_grad()
-        def act(states: np.ndarray) -> np.ndarray:
-            latent = policy.world_model.observe(memory["latent"], memory["action"], *monitor._see(states))
-            memory["latent"], memory["action"] = latent, self._plan(latent)[1]
-            return policy.denormalise_action(memory["action"]).cpu().numpy()[:, 0]
-
-        return act
+        return self.latent_monitor.drive(lambda latent: self._plan(latent)[1])
 
     def _plan(self, latent: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         policy = self.latent_monitor.policy
-        model, margin = policy.world_model, policy.margin
-        now = margin.bounded(model.features(latent))
-        worst_of = []
-        for candidate in policy.critic.candidates:
-            z, worst = latent, now
-            over = torch.zeros_like(now, dtype=torch.bool)
-            for _ in range(self.horizon):
-                z = model.step(z, candidate.expand(len(now), -1))
-                worst = torch.where(over, worst, torch.minimum(worst, margin.bounded(model.features(z))))
-                over = over | model.ended(z)
-            worst_of.append(worst)
-        best = torch.stack(worst_of).max(0)
-        return best.values, policy.critic.candidates[best.indices]
+        return look_ahead(policy.imagination, latent, policy.critic.held_actions(), self.horizon)
 
 
 def feasible_starts(truth: Callable[[np.ndarray], np.ndarray] = exact_value) -> np.ndarray:

@@ -39,7 +39,7 @@ class RSSMConfig(WorldModelConfig):
     hidden: int = 256
     encoder: str = "mlp"
     cnn_depth: int = 32
-    units: int = 256
+    units: int = 240
     image_layers: int = 2
     state_units: int = 64
     state_layers: int = 2
