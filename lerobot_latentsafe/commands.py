@@ -140,6 +140,7 @@ class Wrap:
     output_dir: Path
     base_policy_path: str | None = None
     epsilon: float | None = None
+    guard: int | None = None
     mode: str | None = None
     half: bool = False
     """Store weights in 16 bits."""
@@ -150,10 +151,9 @@ class Wrap:
 
         refuse_existing(self.output_dir)
         policy = LatentSafePolicy.from_pretrained(self.policy.path)
-        if self.epsilon is not None:
-            policy.config.epsilon = self.epsilon
-        if self.mode is not None:
-            policy.config.mode = self.mode
+        for name in ("epsilon", "guard", "mode"):
+            if getattr(self, name) is not None:
+                setattr(policy.config, name, getattr(self, name))
         policy.config.__post_init__()
         if self.base_policy_path:
             policy.attach(self.base_policy_path)
@@ -241,7 +241,8 @@ class EvalShield:
     n_episodes: int = 200
     seed: int = 0
     epsilon: float | None = None
-    """Overrides the filter's."""
+    guard: int | None = None
+    """Both override the filter's."""
     json: Path | None = None
     video: Path | None = None
     """Folder for videos of the first episodes, bare and shielded side by side."""
@@ -257,13 +258,20 @@ class EvalShield:
         if self.n_episodes < 1:
             raise ValueError(f"--n_episodes is {self.n_episodes}; expected at least 1")
         policy = LatentSafePolicy.from_pretrained(self.policy.path)
-        if self.epsilon is not None:
-            policy.config.epsilon = self.epsilon
+        for name in ("epsilon", "guard"):
+            if getattr(self, name) is not None:
+                setattr(policy.config, name, getattr(self, name))
+        policy.config.__post_init__()
         if self.base_policy_path:
             policy.attach(self.base_policy_path)
         result = compare(policy, self.env, self.n_episodes, self.seed, self.n_videos if self.video else 0)
         episodes = result.pop("episodes")
-        row = {**result, "epsilon": policy.config.epsilon, **provenance(seeds=[self.seed])}
+        row = {
+            **result,
+            "epsilon": policy.config.epsilon,
+            "guard": policy.config.guard,
+            **provenance(seeds=[self.seed]),
+        }
         for name in ("bare", "shielded"):
             rates = row[name]
             print(

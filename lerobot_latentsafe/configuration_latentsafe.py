@@ -30,6 +30,8 @@ class LatentSafeConfig(PreTrainedConfig):
             actions are continuous.
         stage: how far training has come: untrained, world_model, reachability. Set by the training commands.
         epsilon: the filter intervenes where V of the predicted next latent is at or below this.
+        guard: steps for which the proposed action is imagined held before V is asked. 1 is the paper's law; more give
+            room for what the world model gets wrong, as time, which a saturated margin cannot.
         calibration: the evidence epsilon was chosen on; written by `latentsafe calibrate`.
         lookahead: steps of imagination before the critic's value is read, 0 to 25: V and the fallback are the best of
             the critic's policy and of holding each action. 0 is the critic alone, and the cheapest.
@@ -55,6 +57,7 @@ class LatentSafeConfig(PreTrainedConfig):
     stage: str = "untrained"
 
     epsilon: float = 0.0
+    guard: int = 1
     calibration: dict[str, float] = field(default_factory=dict)
     lookahead: int = 15
     mode: str = "filter"
@@ -94,6 +97,8 @@ class LatentSafeConfig(PreTrainedConfig):
             raise ValueError(f"--policy.mode is {self.mode!r}; expected one of {', '.join(MODES)}")
         if not 0 <= self.lookahead <= 25:
             raise ValueError(f"--policy.lookahead is {self.lookahead}; expected 0 (critic alone) to 25 imagined steps")
+        if not 1 <= self.guard <= 25:
+            raise ValueError(f"--policy.guard is {self.guard}; expected 1 (the paper's law) to 25 steps")
         if self.margin_delta <= 0:
             raise ValueError(f"--policy.margin_delta is {self.margin_delta}; expected a positive number")
 

@@ -69,12 +69,12 @@ class Shield:
         fault, proposed, inputs = self._check_action(proposed, fault, len(state), without)
         latent = self._filter_history(images, state, fault)
         margin = model.imagination.margin(latent)
-        predicted = model.world_model.step(latent, inputs)
+        predicted, on_the_way = self._go_on(latent, inputs)
         both = {key: torch.cat([predicted[key], latent[key]]) for key in latent}  # one pass through imagination
         (value, here), (_, action) = (part.split(len(state)) for part in model.plan(both))
         fallback = self._usable(action, here)
-        # A margin that is negative now is a failure whatever comes after.
-        value = torch.minimum(value, margin)
+        # A margin that is negative now, or on the way, is a failure whatever comes after.
+        value = torch.minimum(value, torch.minimum(margin, on_the_way))
         if config.deadline_ms is not None and (self.clock() - started) * 1e3 > config.deadline_ms:
             fault = _first_fault(fault, torch.ones_like(fault, dtype=torch.bool), Reason.DEADLINE_MISSED)
         decision = least_restrictive(
@@ -155,6 +155,14 @@ class Shield:
         seen = world_model.correct(predicted, images, state)
         blind = (fault >= Reason.OBSERVATION_NOT_FINITE) & (fault <= Reason.OBSERVATION_STALE)
         return replace_rows(seen, predicted, where=blind)
+
+    def _go_on(self, latent: Latent, action: Tensor) -> tuple[Latent, Tensor]:
+        """The latent after `guard` steps of the action (B, A), and the least margin until there (B,)."""
+        imagination, least = self.filter.imagination, torch.full_like(action[:, 0], torch.inf)
+        for _ in range(self.filter.config.guard):
+            latent = imagination.step(latent, action)
+            least = torch.minimum(least, imagination.margin(latent))
+        return latent, least
 
     def _usable(self, action: Tensor, value: Tensor) -> Tensor:
         """The safety policy's action in robot units; where it or its value is not finite, hold."""

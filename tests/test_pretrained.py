@@ -32,7 +32,7 @@ def test_every_committed_checkpoint_loads():
 
 
 def test_filter_is_small():
-    assert 0 < size_of("dubins") <= 5 * 2**20
+    assert 0 < size_of("dubins") <= 5e6
 
 
 def test_filter_stores_no_path_of_the_machine_it_was_trained_on():

@@ -9,7 +9,6 @@ import numpy as np
 
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE
 from lerobot_latentsafe.envs import dubins
-from lerobot_latentsafe.evaluation.ground_truth import exact_value
 
 if TYPE_CHECKING:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -70,21 +69,26 @@ def reckless_driver(state: np.ndarray) -> float:
     return _steer(state, np.array([1.2, 0.0]))
 
 
-def careful_driver(state: np.ndarray, min_value: float = 0.25) -> float:
-    """Heads for the goal unless that would leave less than `min_value` of safety; then turns away in good time."""
-    wanted = _steer(state, np.array([1.2, 0.0]))
-    choices = np.array([wanted, *dubins.TURN_RATES])
-    values = exact_value(dubins.step(np.repeat(state[None], len(choices), 0), choices))
-    if values[0] > min_value:
-        return wanted
-    safe = np.where(values[1:] > min_value, -np.abs(dubins.TURN_RATES - wanted), values[1:] - 1e3)
-    return float(dubins.TURN_RATES[safe.argmax()])
+def careful_driver(state: np.ndarray, clearance: float = 0.75) -> float:
+    """Heads for the goal; where the way there passes within `clearance` of the centre, along the nearer tangent."""
+    goal, position, heading = np.array([1.2, 0.0]), state[:2], state[2]
+    bearing, centre = (np.arctan2(*to[::-1]) for to in (goal - position, -position))
+    half = np.arcsin(min(1.0, clearance / np.hypot(*position)))
+    blocked = abs(_wrap(bearing - centre)) < half and position @ (goal - position) < 0
+    turns = [_wrap(centre + side * half - heading) for side in (1, -1)] if blocked else [_wrap(bearing - heading)]
+    return _turn_towards(min(turns, key=abs))
+
+
+def _wrap(angle: float) -> float:
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+def _turn_towards(error: float) -> float:
+    return float(np.clip(3.0 * error, -dubins.MAX_TURN_RATE, dubins.MAX_TURN_RATE))
 
 
 def _steer(state: np.ndarray, goal: np.ndarray) -> float:
-    bearing = np.arctan2(*(goal - state[:2])[::-1]) - state[2]
-    bearing = (bearing + np.pi) % (2 * np.pi) - np.pi
-    return float(np.clip(3.0 * bearing, -dubins.MAX_TURN_RATE, dubins.MAX_TURN_RATE))
+    return _turn_towards(_wrap(np.arctan2(*(goal - state[:2])[::-1]) - state[2]))
 
 
 def goal_episodes(
@@ -126,7 +130,7 @@ SOURCES: dict[str, Callable[[int, np.random.Generator], Iterator[Episode]]] = {
     "random": lambda n, rng: random_episodes(n, rng, dubins.TURN_RATES),
     "random_continuous": lambda n, rng: random_episodes(n, rng),
     "random_left_only": lambda n, rng: random_episodes(n, rng, dubins.TURN_RATES[1:]),
-    "careful": lambda n, rng: goal_episodes(n, rng, careful_driver, noise=0.05),
+    "careful": lambda n, rng: goal_episodes(n, rng, careful_driver),
     "reckless": lambda n, rng: goal_episodes(n, rng, reckless_driver),
 }
 """What `latentsafe collect --source=...` can record."""
