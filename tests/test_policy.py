@@ -284,6 +284,11 @@ def test_lookahead_outside_of_what_imagination_can_is_refused():
             tiny.config(lookahead=steps)
 
 
+def test_guard_of_no_steps_is_refused():
+    with pytest.raises(ValueError, match=r"guard is 0; expected 1"):
+        tiny.config(guard=0)
+
+
 def test_epsilon_above_everything_always_overrides(shielded):
     shielded.config.epsilon = math.inf
     assert all(d.intervened.all() and d.reason.eq(Reason.UNSAFE_VALUE).all() for d in tiny.drive(shielded))

@@ -251,6 +251,24 @@ def test_fallback_is_the_plans_first_action_in_robot_units(strict, lookahead):
     assert all(action in [*map(tuple, tiny.CANDIDATES)] for action in map(tuple, decision.action.tolist()))
 
 
+def test_guard_of_one_is_the_papers_law_and_more_steps_look_further(strict):
+    latents, margins = [], []
+    for guard in (1, 3):
+        strict.config.guard = guard
+        strict.shield.reset()
+        strict.shield(along(1)[0], actions(LEFT))
+        action = strict.normalise_action(actions(LEFT))
+        latent, least = strict.shield._go_on(strict.shield.latent, action)
+        expected = strict.shield.latent
+        for _ in range(guard):
+            expected = strict.world_model.step(expected, action)
+        torch.testing.assert_close(latent["h"], expected["h"])
+        latents.append(latent["h"])
+        margins.append(least)
+    assert not torch.allclose(*latents)
+    assert (margins[1] <= margins[0]).all()  # what happens on the way counts
+
+
 def test_continuous_fallback_stays_in_range(tiny_continuous_filter):
     from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 
