@@ -16,6 +16,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "push": ("Push", "push a filter, or a shielded policy, to the Hub with its card"),
     "eval-monitor": ("EvalMonitor", "compare a filter's verdicts with the exact safe set (Table 1)"),
     "eval-shield": ("EvalShield", "run a policy bare and shielded from the same starts"),
+    "label": ("Label", "open a local page on which a person marks where episodes fail"),
     "path": ("PathOf", "print the folder of a committed checkpoint, for LeRobot's commands"),
 }
 """Verb -> its dataclass in `commands.py`, and what it is for."""

@@ -1,6 +1,7 @@
 """The verbs of the console command. Each is a dataclass of options with a `run`."""
 
 import dataclasses
+import getpass
 import logging
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,12 +23,25 @@ class DatasetSource:
 
         return LeRobotDatasetMetadata(self.repo_id, root=self.root)
 
+    def downloaded(self):
+        """Metadata of a dataset whose files are on this machine: one without a folder is fetched from the Hub."""
+        from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+        return self.metadata() if self.root else LeRobotDataset(self.repo_id).meta
+
 
 @dataclass
 class PolicySource:
     """A checkpoint: a folder, a Hub id, or the name of a committed one (see `latentsafe path`)."""
 
     path: str = "dubins"
+
+
+@dataclass
+class OptionalPolicySource:
+    """A checkpoint, or none."""
+
+    path: str | None = None
 
 
 @dataclass
@@ -282,6 +296,38 @@ class EvalShield:
 
             for path in write_videos(episodes, self.video, self.env.fps):
                 print(path)
+
+
+@dataclass
+class Label:
+    """Open a local page on which a person marks where episodes fail; every key is saved beside the dataset.
+
+    With --policy.path, a trained filter draws its margin, guesses, and puts the most useful episodes first.
+    """
+
+    dataset: DatasetSource = field(default_factory=DatasetSource)
+    policy: OptionalPolicySource = field(default_factory=OptionalPolicySource)
+    specifications: list[str] = field(default_factory=lambda: ["failure"])
+    """What can fail: each name gets labels of its own; those that have a label file are offered anyway."""
+    user: str = field(default_factory=getpass.getuser)
+    """Who labels; kept with each label."""
+    host: str = "127.0.0.1"
+    port: int = 8765
+    """0 takes a free one."""
+
+    def run(self) -> None:
+        from lerobot_latentsafe.labeling.app import LabelServer, listen, serve
+        from lerobot_latentsafe.labeling.frames import DatasetFrames
+        from lerobot_latentsafe.labeling.store import LabelStore
+        from lerobot_latentsafe.labeling.suggestions import Suggester
+
+        frames = DatasetFrames(self.dataset.downloaded())
+        store = LabelStore(frames.root, frames.meta.repo_id, self.specifications)
+        server = LabelServer(store, frames, self.user)
+        listener = listen(self.host, self.port)
+        if self.policy.path:
+            server.suggester = Suggester(self.policy.path, frames.meta.repo_id, frames.root, server.suggestion_arrived)
+        serve(server, listener)
 
 
 @dataclass
