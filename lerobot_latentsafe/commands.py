@@ -4,6 +4,7 @@ import dataclasses
 import getpass
 import logging
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 
 from lerobot.envs.configs import EnvConfig
@@ -316,6 +317,8 @@ class Label:
     """0 takes a free one."""
 
     def run(self) -> None:
+        if not (find_spec("starlette") and find_spec("uvicorn")):
+            raise ImportError("the page needs starlette and uvicorn: pip install 'lerobot_policy_latentsafe[label]'")
         from lerobot_latentsafe.labeling.app import LabelServer, listen, serve
         from lerobot_latentsafe.labeling.frames import DatasetFrames
         from lerobot_latentsafe.labeling.store import LabelStore

@@ -268,8 +268,9 @@ function showRow(episode) {
   const row = rowOf(episode), entry = entries[episode];
   if (!row) return;
   const [, bar, text] = row.children;
-  const share = entry.first === null ? 0 : 100 * entry.first / length(episode);
-  bar.firstChild.style.background = entry.mixed ? colour("dim") : entry.first === null ? "none" :
+  const said = entry.first ?? entry.guess, share = 100 * said / length(episode);
+  bar.classList.toggle("guessed", entry.first === null);
+  bar.firstChild.style.background = entry.mixed ? colour("dim") : said === undefined ? "none" :
     `linear-gradient(90deg, ${colour("safe")} ${share}%, ${colour("fail")} ${share}%)`;
   text.textContent = entry.mixed ? "mixed" : entry.first === null ? (entry.guess === undefined ? "–" : "guessed") :
     entry.first === length(episode) ? "safe" : `fails ${entry.first}`;
@@ -350,15 +351,20 @@ function drawTimeline() {
   if (margin) {
     c.strokeStyle = colour("line");
     c.beginPath(); c.moveTo(0, zero); c.lineTo(width, zero); c.stroke();
-    for (const [side, name] of [[1, "safe"], [-1, "fail"]]) {
-      c.fillStyle = colour(name); c.globalAlpha = 0.35;
-      margin.forEach((l, i) => { if (l * side > 0) c.fillRect(i * step, Math.min(zero, y(l)), step + 0.6, Math.abs(y(l) - zero)); });
-      c.globalAlpha = 1;
-    }
-    c.strokeStyle = colour("text"); c.lineWidth = 1.5;
-    c.beginPath(); margin.forEach((l, i) => c.lineTo((i + 0.5) * step, y(l))); c.stroke();
-    c.fillStyle = colour("dim"); c.font = "11px system-ui, sans-serif";
-    c.fillText("margin l: looks safe", 6, 13); c.fillText("looks failed", 6, height - strip - 5);
+    const curve = side => {
+      c.beginPath();
+      if (side) c.moveTo(step / 2, zero);
+      margin.forEach((l, i) => c.lineTo((i + 0.5) * step, side ? Math[side](zero, y(l)) : y(l)));
+      if (side) c.lineTo((n - 0.5) * step, zero);
+    };
+    c.globalAlpha = 0.4;
+    curve("min"); c.fillStyle = colour("safe"); c.fill();
+    curve("max"); c.fillStyle = colour("fail"); c.fill();
+    c.globalAlpha = 1;
+    curve(); c.strokeStyle = colour("text"); c.lineWidth = 1.5; c.stroke();
+    c.fillStyle = colour("dim"); c.font = "11px system-ui, sans-serif"; c.textAlign = "right";
+    c.fillText("margin: looks safe", width - 6, zero - 5); c.fillText("looks failed", width - 6, zero + 13);
+    c.textAlign = "left";
     const guess = entries[current].guess;
     if (guess < n) {
       c.strokeStyle = colour("guess"); c.setLineDash([4, 3]);
