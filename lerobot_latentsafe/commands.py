@@ -3,6 +3,7 @@
 import dataclasses
 import getpass
 import logging
+import os
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -331,6 +332,68 @@ class Label:
         if self.policy.path:
             server.suggester = Suggester(self.policy.path, frames.meta.repo_id, frames.root, server.suggestion_arrived)
         serve(server, listener)
+
+
+@dataclass
+class AutoLabel:
+    """Let a function label the episodes that have no label yet; labels people gave stay.
+
+    Labellers: dubins_truth (the car's recorded position), module:function (your own, see labeling/automatic.py), and
+    vision_language, which asks the model at --url about --failure and takes well-formed answers only. A service's key
+    is read from the environment variable LATENTSAFE_MODEL_KEY.
+    """
+
+    labeller: str
+    dataset: DatasetSource = field(default_factory=DatasetSource)
+    specification: str = "failure"
+    failure: str | None = None
+    """What counts as a failure, in words, for vision_language."""
+    url: str = "http://127.0.0.1:8000/v1"
+    model: str = "default"
+
+    def run(self) -> None:
+        from lerobot_latentsafe.labeling import automatic
+        from lerobot_latentsafe.labeling.frames import DatasetFrames
+        from lerobot_latentsafe.labeling.store import LabelStore
+
+        if self.labeller != "vision_language":
+            labeller = automatic.find_labeller(self.labeller)
+        elif self.failure:
+            endpoint = automatic.ChatEndpoint(self.url, self.model, os.environ.get("LATENTSAFE_MODEL_KEY"))
+            labeller = automatic.VisionLanguageLabeller(endpoint, self.failure)
+        else:
+            raise ValueError("vision_language needs --failure: what counts as one, such as 'a candy left the bag'")
+        frames = DatasetFrames(self.dataset.downloaded())
+        store = LabelStore(frames.root, frames.meta.repo_id, [self.specification])
+        result = automatic.label_automatically(store, frames, self.specification, labeller, self.labeller)
+        for name, episodes in result.items():
+            print(f"{name:10s} {len(episodes)} episodes")
+        for episode, why in result["refused"][:10]:
+            print(f"episode {episode}: {why}")
+
+
+@dataclass
+class WriteLabels:
+    """Copy a dataset with its label files as columns, which LeRobot alone can read, and push it on request."""
+
+    output_dir: Path
+    new_repo_id: str
+    dataset: DatasetSource = field(default_factory=DatasetSource)
+    specifications: list[str] = field(default_factory=lambda: ["failure"])
+    push_to_hub: bool = False
+    private: bool = False
+
+    def run(self) -> None:
+        from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+        from lerobot_latentsafe.labeling.columns import push_dataset, write_columns
+
+        dataset = LeRobotDataset(self.dataset.repo_id, root=self.dataset.root)
+        written = write_columns(dataset, self.specifications, self.output_dir, self.new_repo_id)
+        print(f"{written.num_frames} frames with the columns {', '.join(self.specifications)} in {self.output_dir}")
+        if self.push_to_hub:
+            push_dataset(written, self.private)
+            print(f"pushed to {self.new_repo_id}")
 
 
 @dataclass

@@ -190,6 +190,7 @@ def test_a_key_held_down_labels_one_episode(server, browser):
     with opened(browser, server.address) as page:
         page.keyboard.press("2")
         page.wait_for_timeout(500)
+        press(page, "n")
         shown(page)
         before = verdicts(server, "dropped").count(None)
         page.keyboard.down("s")
