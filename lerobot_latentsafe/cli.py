@@ -19,6 +19,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "label": ("Label", "open a local page on which a person marks where episodes fail"),
     "auto-label": ("AutoLabel", "let a function or a vision-language model label the rest"),
     "write-labels": ("WriteLabels", "copy a dataset with its labels as columns, and push it on request"),
+    "report": ("Report", "write one HTML file about a filter and what it changes"),
     "path": ("PathOf", "print the folder of a committed checkpoint, for LeRobot's commands"),
 }
 """Verb -> its dataclass in `commands.py`, and what it is for."""

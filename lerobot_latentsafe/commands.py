@@ -397,6 +397,34 @@ class WriteLabels:
 
 
 @dataclass
+class Report:
+    """Write one HTML file about a filter and, with a base policy, about what it changes: opens from disk, prints."""
+
+    env: EnvConfig
+    policy: PolicySource = field(default_factory=PolicySource)
+    base_policy_path: str | None = None
+    output: Path = Path("outputs/report.html")
+    n_episodes: int = 50
+    seed: int = 0
+    epsilon: float | None = None
+    """Overrides the filter's."""
+
+    def run(self) -> None:
+        from lerobot_latentsafe.evaluation.filter_report import write_filter_report
+        from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+
+        if self.n_episodes < 1:
+            raise ValueError(f"--n_episodes is {self.n_episodes}; expected at least 1")
+        policy = LatentSafePolicy.from_pretrained(self.policy.path)
+        if self.epsilon is not None:
+            policy.config.epsilon = self.epsilon
+        if self.base_policy_path:
+            policy.attach(self.base_policy_path)
+        write_filter_report(self.output, policy, self.env, self.n_episodes, self.seed)
+        print(f"open {self.output}")
+
+
+@dataclass
 class PathOf:
     """Print the folder of a committed checkpoint."""
 
