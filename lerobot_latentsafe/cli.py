@@ -17,6 +17,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "eval-monitor": ("EvalMonitor", "compare a filter's verdicts with the exact safe set (Table 1)"),
     "eval-shield": ("EvalShield", "run a policy bare and shielded from the same starts"),
     "label": ("Label", "open a local page on which a person marks where episodes fail"),
+    "check-labels": ("CheckLabels", "list the labels that a trained filter disagrees with"),
     "auto-label": ("AutoLabel", "let a function or a vision-language model label the rest"),
     "write-labels": ("WriteLabels", "copy a dataset with its labels as columns, and push it on request"),
     "report": ("Report", "write one HTML file about a filter and what it changes"),

@@ -335,6 +335,33 @@ class Label:
 
 
 @dataclass
+class CheckLabels:
+    """List the labelled episodes that a trained filter disagrees with, the worst first, on one HTML page."""
+
+    policy: PolicySource = field(default_factory=PolicySource)
+    dataset: DatasetSource = field(default_factory=DatasetSource)
+    specification: str = "failure"
+    output: Path = Path("outputs/disagreements.html")
+
+    def run(self) -> None:
+        from lerobot_latentsafe.labeling.disagreements import find_disagreements, in_words, write_disagreements
+        from lerobot_latentsafe.labeling.frames import DatasetFrames
+        from lerobot_latentsafe.labeling.store import LabelStore
+        from lerobot_latentsafe.labeling.suggestions import episode_margins
+        from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+
+        frames = DatasetFrames(self.dataset.downloaded())
+        store = LabelStore(frames.root, frames.meta.repo_id, [self.specification])
+        margins = dict(episode_margins(LatentSafePolicy.from_pretrained(self.policy.path), frames))
+        found = find_disagreements(store, self.specification, margins)
+        for d in found[:20]:
+            label = in_words(store.verdict(self.specification, d.episode).first, len(d.margin))
+            print(f"episode {d.episode:5d}  {d.degree:.2f}  labelled: {label}")
+        write_disagreements(self.output, found, store, frames, self.specification)
+        print(f"{len(found)} disagreements; open {self.output}")
+
+
+@dataclass
 class AutoLabel:
     """Let a function label the episodes that have no label yet; labels people gave stay.
 

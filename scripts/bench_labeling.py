@@ -7,15 +7,19 @@ Needs Chromium, and playwright from the dev extra.
 """
 
 import argparse
+import contextlib
+import http.client
+import io
 import json
+import multiprocessing
 import os
 import random
 import re
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import urllib.request
 from contextlib import contextmanager
@@ -211,35 +215,62 @@ def hand(root: Path, n_episodes: int = 30) -> dict:
 
 
 def kills(root: Path, trials: int = 100) -> dict:
-    """Label as fast as the server answers, kill it at a random moment, and look for every label it said it had."""
-    rng, lost, kept, torn = random.Random(2), 0, 0, 0
-    lengths = [1 + e for e in json.loads((root / "truth.json").read_text())]
+    """Label as fast as the server answers, kill it at a random moment, and look for every label it ever confirmed."""
+    context = multiprocessing.get_context("forkserver")  # the server's imports are done once, not 100 times
+    context.set_forkserver_preload(["lerobot_latentsafe.labeling.app", "lerobot.datasets.dataset_metadata", "uvicorn"])
+    lengths = json.loads((root / "truth.json").read_text())
+    rng, expected, confirmed, lost, unreadable = random.Random(2), read_verdicts(root), 0, 0, 0
     for trial in range(trials):
-        said: dict[int, int] = {}
-        asked = None
-        with labelling(root) as (process, address):
-            end = time.time() + rng.uniform(0.02, 0.6)
-            stopper = subprocess.Popen(["sh", "-c", f"sleep {end - time.time():.3f}; kill -9 {process.pid}"])
-            try:
-                while True:
-                    episode = rng.randrange(len(lengths))
-                    asked = episode, rng.randrange(lengths[episode])
-                    post(address, "api/labels/failure", {"episode": episode, "first": asked[1], "tab": "bench"})
-                    said[episode], asked = asked[1], None
-            except OSError:
-                pass
-            stopper.wait()
-            process.send_signal(signal.SIGKILL)
+        receiver, sender = context.Pipe(duplex=False)
+        server = context.Process(target=serve_once, args=(root, sender), daemon=True)
+        server.start()
+        sender.close()
+        address, episode = receiver.recv(), None
+        seen = [entry["at"] for entry in get(address, "api/labels/failure")["entries"]]
+        killer = threading.Timer(rng.uniform(0.02, 0.8), server.kill)
+        killer.start()
+        with contextlib.suppress(OSError, http.client.HTTPException):
+            for episode in rng.sample(range(len(lengths)), len(lengths)):
+                asked = {
+                    "episode": episode,
+                    "first": rng.randrange(min(lengths)),
+                    "seen": seen[episode],
+                    "tab": "bench",
+                }
+                expected[episode] = post(address, "api/labels/failure", asked)["entry"]["first"]
+                confirmed += 1
+        server.join()
         try:
             found = read_verdicts(root)
         except ValueError:
-            torn += 1
-            continue
-        # The one label that was asked for and not answered may have been saved or not; both are right.
-        lost += sum(found[e] != first for e, first in said.items() if asked is None or e != asked[0])
-        kept += len(said)
-        print(f"trial {trial}: {len(said)} labels, {lost} lost so far", flush=True)
-    return {"trials": trials, "labels_confirmed": kept, "labels_lost": lost, "unreadable_files": torn}
+            unreadable += 1
+            break
+        # The label that was asked for and not confirmed may have been saved or not; both are right.
+        lost += sum(found[e] != first for e, first in expected.items() if e != episode)
+        expected = found
+        print(f"trial {trial}: {confirmed} labels confirmed, {lost} lost", flush=True)
+    return {"trials": trial + 1, "labels_confirmed": confirmed, "labels_lost": lost, "unreadable_files": unreadable}
+
+
+def serve_once(root: Path, sender) -> None:
+    """The server of `latentsafe label` in a process that will be killed; sends its address."""
+    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+
+    from lerobot_latentsafe.labeling.app import LabelServer, listen, serve
+    from lerobot_latentsafe.labeling.frames import DatasetFrames
+    from lerobot_latentsafe.labeling.store import LabelStore
+
+    frames = DatasetFrames(LeRobotDatasetMetadata("bench/cup", root=root))
+    server = LabelServer(LabelStore(root, "bench/cup", ["failure"]), frames, "bench")
+    said = io.StringIO()
+    # The socket listens before the address is printed, so whoever has the address is answered.
+    threading.Timer(0.3, lambda: sender.send(re.search(r"http://\S+/", said.getvalue()).group())).start()
+    with contextlib.redirect_stdout(said):
+        serve(server, listen("127.0.0.1", 0))
+
+
+def get(address: str, path: str) -> dict:
+    return json.load(urllib.request.urlopen(address + path, timeout=30))
 
 
 def post(address: str, path: str, body: dict) -> dict:
@@ -247,7 +278,7 @@ def post(address: str, path: str, body: dict) -> dict:
     request = urllib.request.Request(
         address + path, json.dumps(body).encode(), {"Content-Type": "application/json", "Origin": origin}
     )
-    return json.load(urllib.request.urlopen(request, timeout=10))
+    return json.load(urllib.request.urlopen(request, timeout=30))
 
 
 def main() -> None:

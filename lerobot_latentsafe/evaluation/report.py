@@ -12,7 +12,8 @@ table { border-collapse: collapse; margin: 1rem 0; } td, th { padding: .3rem .8r
 th { border-bottom: 2px solid #222; } td { border-bottom: 1px solid #ddd; font-variant-numeric: tabular-nums; }
 img, video { max-width: 100%; } figure { margin: 1.5rem 0; } figcaption { color: #555; font-size: .9rem; }
 .note { background: #fff6e5; border-left: 4px solid #f0a030; padding: .6rem 1rem; }
-.player video { display: block; width: 100%; max-width: 34rem; margin: 0 auto .5rem; } .player svg { display: block; width: 100%; cursor: ew-resize; }
+.player video { display: block; width: 100%; max-width: 34rem; margin: 0 auto .5rem; }
+.player svg { display: block; width: 100%; cursor: ew-resize; }
 svg text { font: 11px system-ui, sans-serif; fill: #555; }
 .strip { display: flex; gap: 3px; } .strip figure { margin: 0; flex: 1; text-align: center; }
 .strip img { width: 100%; border: 3px solid transparent; image-rendering: pixelated; display: block; }
