@@ -142,12 +142,12 @@ def wait_for_picture(page) -> None:
     )
 
 
-def read_verdicts(root: Path) -> dict[int, int | None]:
+def read_verdicts(root: Path, specification: str = "failure") -> dict[int, int | None]:
     """First failing frames in the label file, read as training reads it."""
     from lerobot_latentsafe.labeling.store import LabelStore
 
-    store = LabelStore(root, "bench/cup", ["failure"])
-    found = {episode: store.verdict("failure", episode).first for episode in range(len(store))}
+    store = LabelStore(root, "bench/cup", [specification])
+    found = {episode: store.verdict(specification, episode).first for episode in range(len(store))}
     store.close()
     return found
 
@@ -155,15 +155,18 @@ def read_verdicts(root: Path) -> dict[int, int | None]:
 # -- what is measured ---
 
 
-def latency(root: Path, n_keys: int = 600) -> dict:
-    """Keys at a practised hand's pace: moves through frames, labels, undo, next; milliseconds."""
+def latency(root: Path, n_episodes: int = 70) -> dict:
+    """A practised hand's keys: a few steps through the frames, a look, a verdict, now and then undo; milliseconds."""
     rng = random.Random(0)
     with labelling(root) as (_, address), page_at(address) as page:
-        page.wait_for_timeout(2000)
+        wait_for_picture(page)
         page.evaluate(LATENCY)
-        for _ in range(n_keys):
-            page.keyboard.press(rng.choices(["ArrowRight", "ArrowLeft", "f", "s", "z", "n"], [5, 2, 3, 3, 1, 1])[0])
-            page.wait_for_timeout(1000 * KEY_S)
+        for _ in range(n_episodes):
+            keys = rng.choices(["ArrowRight", "ArrowLeft", "Shift+ArrowRight"], [6, 1, 2], k=rng.randrange(4, 12))
+            for key in (*keys, rng.choices(["f", "s", "z", "n"], [6, 3, 1, 1])[0]):
+                page.wait_for_timeout(1000 * (DECIDE_S if key in "fszn" else KEY_S))
+                page.keyboard.press(key)
+        page.wait_for_timeout(1000)
         times = page.evaluate("times")
     summary = {}
     for name, values in times.items():
@@ -172,53 +175,77 @@ def latency(root: Path, n_keys: int = 600) -> dict:
     return summary
 
 
-def hand(root: Path, n_episodes: int = 30) -> dict:
-    """A practised hand without a filter's help: looks at the film strip, clicks near the failure, corrects by arrows.
+def hand(root: Path, n_episodes: int = 30, policy: str | None = None) -> dict:
+    """A practised hand: looks, clicks into the film strip near the failure, corrects by arrows, marks.
 
-    Where the hand lands is drawn from a normal distribution of half a thumbnail; every look costs a decision.
+    Where a click lands is drawn from a normal distribution of half a thumbnail; every look costs a decision. With a
+    filter, the page is at its guess already: a right one is accepted, a near one corrected.
     """
-    truth = json.loads((root / "truth.json").read_text())
-    rng, rows = random.Random(1), []
-    with labelling(root) as (_, address), page_at(address) as page:
+    truth, rng, rows = truth_of(root), random.Random(1), []
+    options = [f"--policy.path={policy}", "--specifications=[entered]"] if policy else []
+    with labelling(root, *options) as (_, address), page_at(address) as page:
+        lengths = page.evaluate("async () => (await (await fetch('api/dataset')).json()).lengths")
+        if policy:
+            page.wait_for_function(
+                "() => !document.querySelectorAll('#episodes small').values().some(s => s.innerText === '–')"
+            )
         page.wait_for_timeout(1000)
         for _ in range(n_episodes):
             started, keys = time.time(), 0
             wait_for_picture(page)
-            episode = int(page.get_attribute("#view", "data-episode"))
-            length = page.evaluate("async e => (await (await fetch('api/dataset')).json()).lengths[e]", episode)
+            episode, shown = (int(v) for v in page.get_attribute("#view", "data-shown").split(":"))
+            fails, guessed = truth[episode] < lengths[episode], page.is_visible("#accept")
             page.wait_for_timeout(1000 * DECIDE_S)
-            if truth[episode] < length:
+            key = "f" if fails else "s"
+            if guessed and right_guess(page.inner_text("#accept"), truth[episode], lengths[episode]):
+                key = "Enter"
+            elif fails and not (guessed and abs(shown - truth[episode]) <= 5):
                 box = page.locator("#film").bounding_box()
-                landed = min(max(truth[episode] + rng.gauss(0, length / 32), 0), length - 1)
+                shown = int(min(max(truth[episode] + rng.gauss(0, lengths[episode] / 32), 0), lengths[episode] - 1))
                 page.wait_for_timeout(1000 * POINT_S)
-                page.mouse.click(box["x"] + (landed + 0.5) / length * box["width"], box["y"] + box["height"] / 2)
+                x = box["x"] + (shown + 0.5) / lengths[episode] * box["width"]
+                page.mouse.click(x, box["y"] + box["height"] / 2)
                 keys += 1
                 page.wait_for_timeout(1000 * DECIDE_S)
-                steps = truth[episode] - int(landed)
-                for _ in range(abs(steps)):
-                    page.keyboard.press("ArrowRight" if steps > 0 else "ArrowLeft")
-                    page.wait_for_timeout(1000 * KEY_S)
-                keys += abs(steps)
+            for _ in range(abs(truth[episode] - shown) if key == "f" else 0):
+                page.wait_for_timeout(1000 * KEY_S)
+                page.keyboard.press("ArrowRight" if shown < truth[episode] else "ArrowLeft")
+                keys += 1
             page.wait_for_timeout(1000 * KEY_S)
-            page.keyboard.press("f" if truth[episode] < length else "s")
+            page.keyboard.press(key)
             rows.append((keys + 1, time.time() - started, episode))
         page.wait_for_function("() => document.getElementById('saved').textContent.startsWith('saved')")
-    found = read_verdicts(root)
-    right = sum(found[episode] == truth[episode] for _, _, episode in rows)
+    found = read_verdicts(root, "entered" if policy else "failure")
     return {
+        "filter": policy,
         "keys_per_episode": round(float(np.mean([k for k, _, _ in rows])), 2),
         "seconds_per_episode": round(float(np.mean([s for _, s, _ in rows])), 2),
         "episodes": len(rows),
-        "labels_equal_to_the_truth": right,
+        "labels_equal_to_the_truth": sum(found[episode] == truth[episode] for _, _, episode in rows),
         "model": {"key_s": KEY_S, "point_s": POINT_S, "decide_s": DECIDE_S},
     }
+
+
+def truth_of(root: Path) -> list[int]:
+    """First failing frame of each episode: as filmed, or from the dataset's column."""
+    if (root / "truth.json").exists():
+        return json.loads((root / "truth.json").read_text())
+    from lerobot_latentsafe.datasets.labels import FailureLabels
+
+    labels = FailureLabels.load(root)
+    episodes = [labels.failure[labels.episode == e] for e in range(labels.episode.max() + 1)]
+    return [int(np.r_[e, 1].argmax()) for e in episodes]
+
+
+def right_guess(said: str, first: int, length: int) -> bool:
+    return said.endswith("never fails" if first == length else f" {first}")
 
 
 def kills(root: Path, trials: int = 100) -> dict:
     """Label as fast as the server answers, kill it at a random moment, and look for every label it ever confirmed."""
     context = multiprocessing.get_context("forkserver")  # the server's imports are done once, not 100 times
     context.set_forkserver_preload(["lerobot_latentsafe.labeling.app", "lerobot.datasets.dataset_metadata", "uvicorn"])
-    lengths = json.loads((root / "truth.json").read_text())
+    lengths = truth_of(root)
     rng, expected, confirmed, lost, unreadable = random.Random(2), read_verdicts(root), 0, 0, 0
     for trial in range(trials):
         receiver, sender = context.Pipe(duplex=False)
@@ -286,6 +313,7 @@ def main() -> None:
     parser.add_argument("what", choices=("film", "latency", "hand", "kills"))
     parser.add_argument("--root", type=Path, required=True)
     parser.add_argument("--n_episodes", type=int, default=1300)
+    parser.add_argument("--policy", help="hand: with the suggestions of this filter")
     arguments = parser.parse_args()
     if arguments.what == "film":
         first = film(arguments.root, arguments.n_episodes)
@@ -296,11 +324,15 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:  # labels go to a copy that shares the videos
         copy = Path(folder) / "filmed"
         shutil.copytree(arguments.root, copy, copy_function=os.link, ignore=shutil.ignore_patterns("labels"))
-        row = globals()[arguments.what](copy)
-        episodes = len(json.loads((copy / "truth.json").read_text()))
-    row |= {"dataset": {"episodes": episodes, "cameras": len(CAMERAS), "fps": FPS}, **provenance(seeds=[0])}
+        options = {"policy": arguments.policy} if arguments.policy else {}
+        row = globals()[arguments.what](copy, **options)
+        info = json.loads((copy / "meta" / "info.json").read_text())
+    cameras = sum(f["dtype"] in ("image", "video") for f in info["features"].values())
+    row |= {"dataset": {"episodes": info["total_episodes"], "cameras": cameras, "fps": info["fps"]}}
+    row |= {"load_average": round(os.getloadavg()[0], 1), **provenance(seeds=[0])}
     print(json.dumps(row, indent=2))
-    write_json(Path("results/labels") / f"{arguments.what}.json", row)
+    name = f"{arguments.what}_suggested" if arguments.policy else arguments.what
+    write_json(Path("results/labels") / f"{name}.json", row)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,13 @@
 import shutil
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import tiny
 
 from lerobot_latentsafe.cli import main
+from lerobot_latentsafe.labeling import suggestions
 from lerobot_latentsafe.labeling.disagreements import find_disagreements
 from lerobot_latentsafe.labeling.frames import DatasetFrames
 from lerobot_latentsafe.labeling.store import LabelStore
@@ -73,9 +75,15 @@ def test_a_process_of_its_own_judges_all_episodes(root, tiny_filter):
     assert sorted(suggester.known) == list(range(14)) and sorted(new) == list(range(1, 14))
 
 
-def test_filter_that_does_not_fit_is_a_message(root):
-    with pytest.raises(RuntimeError, match=r"no suggestions from no/such/filter.*no checkpoint"):
-        Suggester("no/such/filter", tiny.REPO_ID, root, print)
+@pytest.mark.parametrize(
+    ("path", "why"),
+    [("no/such/filter", "no checkpoint"), ("dubins_diffusion_reckless", "expected a 'latentsafe' filter")],
+)
+def test_filter_that_cannot_judge_says_why(root, monkeypatch, path, why):
+    said = []
+    monkeypatch.setattr("os.nice", lambda by: None)
+    suggestions._judge(path, tiny.REPO_ID, str(root), SimpleNamespace(send=said.append))
+    assert len(said) == 1 and why in said[0]
 
 
 def test_disagreements_name_the_slip(root, tmp_path, capsys):

@@ -2,7 +2,8 @@
 // this browser, shown, and sent again until the server has it.
 
 const $ = id => document.getElementById(id);
-const colour = name => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
+const style = getComputedStyle(document.documentElement); // read once: asking again makes the browser lay out the page
+const COLOUR = Object.fromEntries(["line", "text", "dim", "safe", "fail", "guess"].map(name => [name, style.getPropertyValue(`--${name}`).trim()]));
 const THUMBS = 16, AHEAD = 3, KEPT = 8, POLL_MS = 1500, SPEEDS = [0.25, 0.5, 1, 2, 4, 8];
 
 let dataset, specification, entries = [], order = [], current = -1, frame = 0, changes = 0;
@@ -165,7 +166,6 @@ function fetchAhead() {
 let wanted = 0;
 async function draw() {
   const mine = ++wanted, [episode, index] = [current, frame];
-  drawTimeline();
   const blobs = await pictures(episode);
   const images = await Promise.all(blobs.map(camera => createImageBitmap(camera[index])));
   if (mine !== wanted) return;
@@ -221,6 +221,7 @@ async function open(episode) {
   $("task").textContent = dataset.tasks[episode];
   showVerdict();
   showFrame();
+  draw().catch(() => {});
   $("film").getContext("2d").clearRect(0, 0, $("film").width, $("film").height);
   if (entry.guess !== undefined) loadMargin(episode);
   try {
@@ -270,8 +271,8 @@ function showRow(episode) {
   const [, bar, text] = row.children;
   const said = entry.first ?? entry.guess, share = 100 * said / length(episode);
   bar.classList.toggle("guessed", entry.first === null);
-  bar.firstChild.style.background = entry.mixed ? colour("dim") : said === undefined ? "none" :
-    `linear-gradient(90deg, ${colour("safe")} ${share}%, ${colour("fail")} ${share}%)`;
+  bar.firstChild.style.background = entry.mixed ? COLOUR.dim : said === undefined ? "none" :
+    `linear-gradient(90deg, ${COLOUR.safe} ${share}%, ${COLOUR.fail} ${share}%)`;
   text.textContent = entry.mixed ? "mixed" : entry.first === null ? (entry.guess === undefined ? "–" : "guessed") :
     entry.first === length(episode) ? "safe" : `fails ${entry.first}`;
   text.classList.toggle("odd", entry.first !== null && entry.contradiction > 0.7);
@@ -294,14 +295,13 @@ function showVerdict() {
   const guess = entry.guess;
   $("accept").hidden = guess === undefined || entry.first !== null;
   if (guess !== undefined) $("accept").lastElementChild.textContent = guess === length(current) ? "guess: never fails" : `guess: fails from ${guess}`;
-  draw();
+  drawTimeline();
 }
 
 function showFrame() {
   const seconds = i => (i / dataset.fps).toFixed(2);
   $("frame").textContent = `frame ${frame} of ${length(current) - 1}  ·  ${seconds(frame)} s of ${seconds(length(current) - 1)} s`;
   $("speed").textContent = `${playing ? "playing" : "paused"} · ${speed}×`;
-  draw().catch(() => {});
 }
 
 function showProgress() {
@@ -331,25 +331,27 @@ function fit(canvas) { // sharp on any screen; returns a context in CSS pixels
   return [context, width, height];
 }
 
-function frameLabels(episode) {
-  const { first, mixed } = entries[episode];
-  return Array.from({ length: length(episode) }, (_, i) => mixed ? mixed[i] : first === null ? -1 : Number(i >= first));
+function runs(episode) { // [label, from, to] of frames with the same label
+  const { first, mixed } = entries[episode], n = length(episode);
+  if (!mixed) return first === null ? [[-1, 0, n]] : [[0, 0, first], [1, first, n]];
+  const starts = mixed.map((_, i) => i).filter(i => i === 0 || mixed[i] !== mixed[i - 1]);
+  return starts.map((from, i) => [mixed[from], from, starts[i + 1] ?? n]);
 }
 
 function drawTimeline() {
   const [c, width, height] = fit($("timeline")), n = length(current), step = width / n, strip = 10;
   c.clearRect(0, 0, width, height);
-  frameLabels(current).forEach((label, i) => {
-    c.fillStyle = [colour("line"), colour("safe"), colour("fail")][label + 1];
-    c.fillRect(i * step, height - strip, step + 0.6, strip);
-    if (label !== 1) return;
+  for (const [label, from, to] of runs(current)) {
+    c.fillStyle = [COLOUR.line, COLOUR.safe, COLOUR.fail][label + 1];
+    c.fillRect(from * step, height - strip, (to - from) * step, strip);
+    if (label !== 1) continue;
     c.globalAlpha = 0.14; // failing is also marked by a shade over the whole height, not by colour alone
-    c.fillRect(i * step, 0, step + 0.6, height - strip);
+    c.fillRect(from * step, 0, (to - from) * step, height - strip);
     c.globalAlpha = 1;
-  });
+  }
   const zero = (height - strip) / 2, y = l => zero - l * (zero - 5);
   if (margin) {
-    c.strokeStyle = colour("line");
+    c.strokeStyle = COLOUR.line;
     c.beginPath(); c.moveTo(0, zero); c.lineTo(width, zero); c.stroke();
     const curve = side => {
       c.beginPath();
@@ -358,20 +360,20 @@ function drawTimeline() {
       if (side) c.lineTo((n - 0.5) * step, zero);
     };
     c.globalAlpha = 0.4;
-    curve("min"); c.fillStyle = colour("safe"); c.fill();
-    curve("max"); c.fillStyle = colour("fail"); c.fill();
+    curve("min"); c.fillStyle = COLOUR.safe; c.fill();
+    curve("max"); c.fillStyle = COLOUR.fail; c.fill();
     c.globalAlpha = 1;
-    curve(); c.strokeStyle = colour("text"); c.lineWidth = 1.5; c.stroke();
-    c.fillStyle = colour("dim"); c.font = "11px system-ui, sans-serif"; c.textAlign = "right";
+    curve(); c.strokeStyle = COLOUR.text; c.lineWidth = 1.5; c.stroke();
+    c.fillStyle = COLOUR.dim; c.font = "11px system-ui, sans-serif"; c.textAlign = "right";
     c.fillText("margin: looks safe", width - 6, zero - 5); c.fillText("looks failed", width - 6, zero + 13);
     c.textAlign = "left";
     const guess = entries[current].guess;
     if (guess < n) {
-      c.strokeStyle = colour("guess"); c.setLineDash([4, 3]);
+      c.strokeStyle = COLOUR.guess; c.setLineDash([4, 3]);
       c.beginPath(); c.moveTo(guess * step, 0); c.lineTo(guess * step, height - strip); c.stroke(); c.setLineDash([]);
     }
   } else {
-    c.fillStyle = colour("dim"); c.font = "11px system-ui, sans-serif";
+    c.fillStyle = COLOUR.dim; c.font = "11px system-ui, sans-serif";
     c.fillText(dataset.suggestions ? "the filter has not looked at this episode yet" : "time line: click or drag", 6, 15);
   }
   c.fillStyle = "#fff";
@@ -397,6 +399,8 @@ async function drawFilm(episode) {
 function go(to) {
   frame = Math.max(0, Math.min(length(current) - 1, to));
   showFrame();
+  drawTimeline();
+  draw().catch(() => {});
 }
 
 function stop() { clearInterval(playing); playing = 0; }
