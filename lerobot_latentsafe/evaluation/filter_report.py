@@ -128,11 +128,9 @@ def _worth_showing(bare: Episodes, shielded: Episodes) -> list[int]:
     """One that the filter saved, one that it did not, one that it left alone, then others."""
     n = len(shielded.frames)
     saved, failed = bare.violation[:n] & ~shielded.violation[:n], shielded.violation[:n]
-    kinds = (saved, failed, shielded.overridden[:n] == 0, np.ones(n, bool))
-    picked: list[int] = []
-    for kind in (*kinds, *kinds):
-        picked += [i for i in np.flatnonzero(kind).tolist() if i not in picked][:1]
-    return sorted(picked[:SHOWN])
+    kinds = [np.flatnonzero(kind) for kind in (saved, failed, shielded.overridden[:n] == 0)]
+    wanted = [int(found[0]) for found in kinds if len(found)] + list(range(n))
+    return sorted(list(dict.fromkeys(wanted))[:SHOWN])
 
 
 def _charts(trace: dict[str, list], policy: LatentSafePolicy, fps: int, seconds: float) -> list[str]:
