@@ -16,6 +16,11 @@ VERBS: dict[str, tuple[str, str]] = {
     "push": ("Push", "push a filter, or a shielded policy, to the Hub with its card"),
     "eval-monitor": ("EvalMonitor", "compare a filter's verdicts with the exact safe set (Table 1)"),
     "eval-shield": ("EvalShield", "run a policy bare and shielded from the same starts"),
+    "label": ("Label", "open a local page on which a person marks where episodes fail"),
+    "check-labels": ("CheckLabels", "list the labels that a trained filter disagrees with"),
+    "auto-label": ("AutoLabel", "let a function or a vision-language model label the rest"),
+    "write-labels": ("WriteLabels", "copy a dataset with its labels as columns, and push it on request"),
+    "report": ("Report", "write one HTML file about a filter and what it changes"),
     "path": ("PathOf", "print the folder of a committed checkpoint, for LeRobot's commands"),
 }
 """Verb -> its dataclass in `commands.py`, and what it is for."""

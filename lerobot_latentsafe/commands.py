@@ -1,8 +1,11 @@
 """The verbs of the console command. Each is a dataclass of options with a `run`."""
 
 import dataclasses
+import getpass
 import logging
+import os
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 
 from lerobot.envs.configs import EnvConfig
@@ -22,12 +25,25 @@ class DatasetSource:
 
         return LeRobotDatasetMetadata(self.repo_id, root=self.root)
 
+    def downloaded(self):
+        """Metadata of a dataset whose files are on this machine: one without a folder is fetched from the Hub."""
+        from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+        return self.metadata() if self.root else LeRobotDataset(self.repo_id).meta
+
 
 @dataclass
 class PolicySource:
     """A checkpoint: a folder, a Hub id, or the name of a committed one (see `latentsafe path`)."""
 
     path: str = "dubins"
+
+
+@dataclass
+class OptionalPolicySource:
+    """A checkpoint, or none."""
+
+    path: str | None = None
 
 
 @dataclass
@@ -292,6 +308,157 @@ class EvalShield:
 
             for path in write_videos(episodes, self.video, self.env.fps):
                 print(path)
+
+
+@dataclass
+class Label:
+    """Open a local page on which a person marks where episodes fail; every key is saved beside the dataset.
+
+    With --policy.path, a trained filter draws its margin, guesses, and puts the most useful episodes first.
+    """
+
+    dataset: DatasetSource = field(default_factory=DatasetSource)
+    policy: OptionalPolicySource = field(default_factory=OptionalPolicySource)
+    specifications: list[str] = field(default_factory=lambda: ["failure"])
+    """What can fail: each name gets labels of its own; those that have a label file are offered anyway."""
+    user: str = field(default_factory=getpass.getuser)
+    """Who labels; kept with each label."""
+    host: str = "127.0.0.1"
+    port: int = 8765
+    """0 takes a free one."""
+
+    def run(self) -> None:
+        if not (find_spec("starlette") and find_spec("uvicorn")):
+            raise ImportError("the page needs starlette and uvicorn: pip install 'lerobot_policy_latentsafe[label]'")
+        from lerobot_latentsafe.labeling.app import LabelServer, listen, serve
+        from lerobot_latentsafe.labeling.frames import DatasetFrames
+        from lerobot_latentsafe.labeling.store import LabelStore
+        from lerobot_latentsafe.labeling.suggestions import Suggester
+
+        frames = DatasetFrames(self.dataset.downloaded())
+        store = LabelStore(frames.root, frames.meta.repo_id, self.specifications)
+        server = LabelServer(store, frames, self.user)
+        listener = listen(self.host, self.port)
+        if self.policy.path:
+            server.suggester = Suggester(self.policy.path, frames.meta.repo_id, frames.root, server.suggestion_arrived)
+        serve(server, listener)
+
+
+@dataclass
+class CheckLabels:
+    """List the labelled episodes that a trained filter disagrees with, the worst first, on one HTML page."""
+
+    policy: PolicySource = field(default_factory=PolicySource)
+    dataset: DatasetSource = field(default_factory=DatasetSource)
+    specification: str = "failure"
+    output: Path = Path("outputs/disagreements.html")
+
+    def run(self) -> None:
+        from lerobot_latentsafe.labeling.disagreements import find_disagreements, in_words, write_disagreements
+        from lerobot_latentsafe.labeling.frames import DatasetFrames
+        from lerobot_latentsafe.labeling.store import LabelStore
+        from lerobot_latentsafe.labeling.suggestions import episode_margins
+        from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+
+        frames = DatasetFrames(self.dataset.downloaded())
+        store = LabelStore(frames.root, frames.meta.repo_id, [self.specification])
+        margins = dict(episode_margins(LatentSafePolicy.from_pretrained(self.policy.path), frames))
+        found = find_disagreements(store, self.specification, margins)
+        for d in found[:20]:
+            label = in_words(store.verdict(self.specification, d.episode).first, len(d.margin))
+            print(f"episode {d.episode:5d}  {d.degree:.2f}  labelled: {label}")
+        write_disagreements(self.output, found, store, frames, self.specification)
+        print(f"{len(found)} disagreements; open {self.output}")
+
+
+@dataclass
+class AutoLabel:
+    """Let a function label the episodes that have no label yet; labels people gave stay.
+
+    Labellers: dubins_truth (the car's recorded position), module:function (your own, see labeling/automatic.py), and
+    vision_language, which asks the model at --url about --failure and takes well-formed answers only. A service's key
+    is read from the environment variable LATENTSAFE_MODEL_KEY.
+    """
+
+    labeller: str
+    dataset: DatasetSource = field(default_factory=DatasetSource)
+    specification: str = "failure"
+    failure: str | None = None
+    """What counts as a failure, in words, for vision_language."""
+    url: str = "http://127.0.0.1:8000/v1"
+    model: str = "default"
+
+    def run(self) -> None:
+        from lerobot_latentsafe.labeling import automatic
+        from lerobot_latentsafe.labeling.frames import DatasetFrames
+        from lerobot_latentsafe.labeling.store import LabelStore
+
+        if self.labeller != "vision_language":
+            labeller = automatic.find_labeller(self.labeller)
+        elif self.failure:
+            endpoint = automatic.ChatEndpoint(self.url, self.model, os.environ.get("LATENTSAFE_MODEL_KEY"))
+            labeller = automatic.VisionLanguageLabeller(endpoint, self.failure)
+        else:
+            raise ValueError("vision_language needs --failure: what counts as one, such as 'a candy left the bag'")
+        frames = DatasetFrames(self.dataset.downloaded())
+        store = LabelStore(frames.root, frames.meta.repo_id, [self.specification])
+        result = automatic.label_automatically(store, frames, self.specification, labeller, self.labeller)
+        for name, episodes in result.items():
+            print(f"{name:10s} {len(episodes)} episodes")
+        for episode, why in result["refused"][:10]:
+            print(f"episode {episode}: {why}")
+
+
+@dataclass
+class WriteLabels:
+    """Copy a dataset with its label files as columns, which LeRobot alone can read, and push it on request."""
+
+    output_dir: Path
+    new_repo_id: str
+    dataset: DatasetSource = field(default_factory=DatasetSource)
+    specifications: list[str] = field(default_factory=lambda: ["failure"])
+    push_to_hub: bool = False
+    private: bool = False
+
+    def run(self) -> None:
+        from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+        from lerobot_latentsafe.labeling.columns import push_dataset, write_columns
+
+        dataset = LeRobotDataset(self.dataset.repo_id, root=self.dataset.root)
+        written = write_columns(dataset, self.specifications, self.output_dir, self.new_repo_id)
+        print(f"{written.num_frames} frames with the columns {', '.join(self.specifications)} in {self.output_dir}")
+        if self.push_to_hub:
+            push_dataset(written, self.private)
+            print(f"pushed to {self.new_repo_id}")
+
+
+@dataclass
+class Report:
+    """Write one HTML file about a filter and, with a base policy, about what it changes: opens from disk, prints."""
+
+    env: EnvConfig
+    policy: PolicySource = field(default_factory=PolicySource)
+    base_policy_path: str | None = None
+    output: Path = Path("outputs/report.html")
+    n_episodes: int = 50
+    seed: int = 0
+    epsilon: float | None = None
+    """Overrides the filter's."""
+
+    def run(self) -> None:
+        from lerobot_latentsafe.evaluation.filter_report import write_filter_report
+        from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+
+        if self.n_episodes < 1:
+            raise ValueError(f"--n_episodes is {self.n_episodes}; expected at least 1")
+        policy = LatentSafePolicy.from_pretrained(self.policy.path)
+        if self.epsilon is not None:
+            policy.config.epsilon = self.epsilon
+        if self.base_policy_path:
+            policy.attach(self.base_policy_path)
+        write_filter_report(self.output, policy, self.env, self.n_episodes, self.seed)
+        print(f"open {self.output}")
 
 
 @dataclass

@@ -1,16 +1,202 @@
 """Failure labels: one verdict a frame, kept outside `observation.*` so that no policy can read the answer."""
 
+import hashlib
+import json
+import os
+import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 
 FAILING, SAFE, UNLABELLED = 1, 0, -1
+FOLDER, SCHEMA, METADATA = "labels", 1, b"latentsafe_labels"
+NAME = re.compile(r"(?!action|observation|index|episode|frame|task|timestamp|next)[a-z][a-z0-9_]{0,39}")
+"""Names of specifications: a file and a column, and none that LeRobot would hand to a policy."""
 
 
 class UnlabelledDatasetError(ValueError):
     """The dataset has no usable failure labels."""
+
+
+class LabelFileError(UnlabelledDatasetError):
+    """A label file of another dataset, of another schema, or with values that are no labels."""
+
+
+def sidecar_path(root: str | Path, specification: str) -> Path:
+    """`labels/<specification>.parquet` of a dataset.
+
+    Raises:
+        LabelFileError: the name is not fit for a file and a column.
+    """
+    if not NAME.fullmatch(specification):
+        raise LabelFileError(
+            f"specification name {specification!r} is not usable: expected lower-case letters, digits and _ (at most "
+            "40, a letter first), such as failure or spilled, and no name that LeRobot gives columns of its own"
+        )
+    return Path(root) / FOLDER / f"{specification}.parquet"
+
+
+def specifications_of(root: str | Path) -> list[str]:
+    """Names of the specifications that have a label file."""
+    return sorted(p.stem for p in (Path(root) / FOLDER).glob("*.parquet") if NAME.fullmatch(p.stem))
+
+
+def read_frames(root: str | Path, columns: Iterable[str] = ()) -> dict[str, np.ndarray]:
+    """`index`, `episode_index` and those of `columns` that exist, of every frame in the order of the index.
+
+    Raises:
+        UnlabelledDatasetError: no dataset at root.
+    """
+    files = sorted(Path(root).glob("data/*/*.parquet"))
+    if not files:
+        raise UnlabelledDatasetError(f"{root} holds no data/*/*.parquet; is it a LeRobotDataset (v3) folder?")
+    present = set(pq.ParquetFile(files[0]).schema_arrow.names)
+    wanted = ["index", "episode_index", *sorted(set(columns) & present)]
+    table = pa.concat_tables([pq.read_table(file, columns=wanted) for file in files]).combine_chunks()
+    order = np.argsort(np.asarray(table["index"]))
+    return {name: _to_numpy(table[name].combine_chunks())[order] for name in wanted}
+
+
+def _to_numpy(column: pa.Array) -> np.ndarray:
+    """(N,) or (N, D): lists of one length become rows, anything ragged or with holes an array of objects."""
+    if isinstance(column, pa.ChunkedArray):
+        column = pa.concat_arrays(column.chunks) if column.num_chunks else pa.array([], column.type)
+    if pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type):
+        values = column.flatten().to_numpy(zero_copy_only=False)
+        if len(column) and len(values) % len(column) == 0:
+            return values.reshape(len(column), -1)
+    return column.to_numpy(zero_copy_only=False)
+
+
+def identity(frames: dict[str, np.ndarray], n: int) -> str:
+    """Tells datasets apart by the episodes and actions of their first n frames.
+
+    Copies without cameras, with more columns or with episodes recorded since keep the identity of those n frames.
+    """
+    digest = hashlib.sha256(np.ascontiguousarray(frames["episode_index"][:n], dtype="<i8").tobytes())
+    if "action" in frames:
+        digest.update(np.ascontiguousarray(frames["action"][:n], dtype="<f4").tobytes())
+    return digest.hexdigest()[:16]
+
+
+@dataclass
+class Sidecar:
+    """The label file of one specification: labels by frame index, and who gave each, and when.
+
+    Attributes:
+        failure: int8 (N,).
+        by: int32 (N,), a place in `names`, or -1.
+        at: int64 (N,), microseconds since 1970 UTC; 0 where unlabelled or unknown.
+        names: who labelled.
+    """
+
+    failure: np.ndarray
+    by: np.ndarray
+    at: np.ndarray
+    names: list[str]
+
+    @classmethod
+    def empty(cls, n: int) -> "Sidecar":
+        return cls(np.full(n, UNLABELLED, np.int8), np.full(n, -1, np.int32), np.zeros(n, np.int64), [])
+
+    @classmethod
+    def read(cls, path: Path, frames: dict[str, np.ndarray]) -> "Sidecar":
+        """Read a file written by `write`, or a plain table with the columns `index` and `failure`.
+
+        A file written before more episodes were recorded leaves those unlabelled.
+
+        Raises:
+            LabelFileError: of another dataset, of another schema, not readable, or values that are no labels.
+        """
+        try:
+            table = pq.read_table(path)
+        except (pa.ArrowInvalid, OSError) as e:
+            raise LabelFileError(f"{path} is not a readable parquet file ({e}); restore it or move it away") from e
+        missing = {"index", "failure"} - set(table.column_names)
+        if missing:
+            raise LabelFileError(f"{path} lacks the columns {sorted(missing)}; expected index and failure")
+        n, index = len(frames["index"]), _to_numpy(table["index"].combine_chunks())
+        covered = n
+        if METADATA in (table.schema.metadata or {}):
+            covered = cls._check_metadata(path, json.loads(table.schema.metadata[METADATA]), frames)
+        if len(index) != covered or not np.array_equal(np.sort(index), np.arange(covered)):
+            raise LabelFileError(
+                f"{path} labels {len(index)} frames, the dataset has {n}; expected each index 0..{covered - 1} once. "
+                "It may belong to another dataset"
+            )
+        sidecar = cls.empty(n)
+        failure = _to_numpy(table["failure"].combine_chunks())
+        sidecar.failure[index] = _as_labels(failure, covered, str(path))
+        if "labelled_by" in table.column_names:
+            column = table["labelled_by"].combine_chunks()
+            column = column if pa.types.is_dictionary(column.type) else column.dictionary_encode()
+            sidecar.by[index], sidecar.names = column.indices.fill_null(-1).to_numpy(), column.dictionary.to_pylist()
+        if "labelled_at" in table.column_names:
+            sidecar.at[index] = table["labelled_at"].cast(pa.int64()).fill_null(0).to_numpy()
+        return sidecar
+
+    @staticmethod
+    def _check_metadata(path: Path, written: dict, frames: dict[str, np.ndarray]) -> int:
+        """How many frames a file covers, once its schema and dataset are known to be ours."""
+        if written.get("schema") != SCHEMA:
+            raise LabelFileError(
+                f"{path} has schema {written.get('schema')}, this version reads and writes {SCHEMA}; "
+                "use the version that wrote it, or move the file away. Nothing was overwritten"
+            )
+        covered = written["frames"]
+        found = identity(frames, covered) if covered <= len(frames["index"]) else "fewer frames"
+        if found != written["identity"]:
+            raise LabelFileError(
+                f"{path} was made for another dataset ({written['repo_id']}, {covered} frames, {written['identity']}); "
+                f"this one has {len(frames['index'])} frames ({found}). Move the file to its dataset. Nothing was "
+                "overwritten"
+            )
+        return covered
+
+    def write(self, path: Path, repo_id: str, identity: str) -> None:
+        """Replace the file atomically: whatever happens, the old or the new one is there, whole."""
+        n = len(self.failure)
+        described = {"schema": SCHEMA, "frames": n, "identity": identity, "repo_id": repo_id}
+        by = pa.DictionaryArray.from_arrays(pa.array(self.by, mask=self.by < 0), pa.array(self.names, pa.string()))
+        table = pa.table(
+            {
+                "index": pa.array(np.arange(n)),
+                "failure": pa.array(self.failure),
+                "labelled_by": by,
+                "labelled_at": pa.array(self.at, pa.timestamp("us", "UTC"), mask=self.at == 0),
+            }
+        ).replace_schema_metadata({METADATA: json.dumps(described)})
+        partial = path.with_name(f".{path.name}.partial")
+        try:
+            with partial.open("wb") as file:
+                pq.write_table(
+                    table,
+                    file,
+                    use_dictionary=["labelled_by", "labelled_at"],
+                    column_encoding={"index": "DELTA_BINARY_PACKED"},
+                    compression="zstd",
+                )
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(partial, path)
+        except BaseException:
+            partial.unlink(missing_ok=True)
+            raise
+        _sync_folder(path.parent)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make a rename survive a power cut, where the system knows how."""
+    if hasattr(os, "O_DIRECTORY"):
+        descriptor = os.open(folder, os.O_DIRECTORY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 @dataclass
@@ -38,37 +224,22 @@ class FailureLabels:
             UnlabelledDatasetError: neither exists, a sidecar does not match the frames, or one class is missing.
         """
         root = Path(root)
-        files = sorted(root.glob("data/*/*.parquet"))
-        if not files:
-            raise UnlabelledDatasetError(f"{root} holds no data/*/*.parquet; is it a LeRobotDataset (v3) folder?")
-        columns = set(pq.ParquetFile(files[0]).schema_arrow.names)
-        wanted = ["index", "episode_index", *({specification, "next.done"} & columns)]
-        table = {name: [] for name in wanted}
-        for file in files:
-            read = pq.read_table(file, columns=wanted)
-            for name in wanted:
-                table[name].append(np.asarray(read[name].to_pylist()).reshape(-1))
-        data = {name: np.concatenate(parts) for name, parts in table.items()}
-        order = np.argsort(data["index"])
-        n = len(order)
-        episode = data["episode_index"][order].astype(np.int64)
+        data = read_frames(root, [specification, "next.done", "action"])
+        n, episode = len(data["index"]), data["episode_index"].astype(np.int64)
         terminal = np.full(n, UNLABELLED, np.int8)
         if "next.done" in data:
-            terminal = _as_labels(data["next.done"][order], n, f"column 'next.done' of {root}")
-        sidecar = root / "labels" / f"{specification}.parquet"
+            terminal = _as_labels(data["next.done"], n, f"column 'next.done' of {root}")
+        sidecar = sidecar_path(root, specification)
         if sidecar.exists():
-            failure = _read_sidecar(sidecar, n)
+            failure = Sidecar.read(sidecar, data).failure
         elif specification in data:
-            if len(data[specification]) != n:
-                raise UnlabelledDatasetError(
-                    f"column {specification!r} of {root} holds {len(data[specification])} labels for {n} frames; "
-                    "expected one a frame"
-                )
-            failure = _as_labels(data[specification][order], n, f"column {specification!r} of {root}")
+            failure = _as_labels(data[specification], n, f"column {specification!r} of {root}")
         else:
+            columns = pq.ParquetFile(next(root.glob("data/*/*.parquet"))).schema_arrow.names
             raise UnlabelledDatasetError(
-                f"{root} has no failure labels: expected a column {specification!r} (1 failing, 0 safe, "
-                f"-1 unlabelled) or {sidecar.relative_to(root)}; its columns are {', '.join(sorted(columns))}"
+                f"{root} has no failure labels: expected a column {specification!r} (1 failing, 0 "
+                f"safe, -1 unlabelled) or {sidecar.relative_to(root)}, which latentsafe label makes; its columns are "
+                f"{', '.join(sorted(columns))}, its label files {', '.join(specifications_of(root)) or 'none'}"
             )
         labels = cls(failure, terminal, episode)
         labels._check(root, specification)
@@ -90,25 +261,11 @@ class FailureLabels:
 
 def _as_labels(values: np.ndarray, n: int, source: str) -> np.ndarray:
     """Exactly -1, 0 or 1 for each of n frames: what is cast to int8 unchecked could turn into "safe"."""
+    if values.shape == (n, 1):
+        values = values[:, 0]
     if values.shape != (n,):
-        raise UnlabelledDatasetError(f"{source} holds {values.size} labels for {n} frames; expected one a frame")
-    unknown = sorted({str(v) for v in values.tolist() if v not in (FAILING, SAFE, UNLABELLED)})
+        raise LabelFileError(f"{source} holds {values.size} labels for {n} frames; expected one a frame")
+    unknown = sorted({str(v) for v in set(values.tolist()) if v not in (FAILING, SAFE, UNLABELLED)})
     if unknown:
-        raise UnlabelledDatasetError(f"{source} holds {', '.join(unknown[:5])}; expected 1, 0 or -1")
+        raise LabelFileError(f"{source} holds {', '.join(unknown[:5])}; expected 1, 0 or -1")
     return values.astype(np.int8)
-
-
-def _read_sidecar(path: Path, n: int) -> np.ndarray:
-    table = pq.read_table(path)
-    missing = {"index", "failure"} - set(table.column_names)
-    if missing:
-        raise UnlabelledDatasetError(f"{path} lacks the columns {sorted(missing)}; expected index and failure")
-    index, failure = np.asarray(table["index"]), np.asarray(table["failure"].to_pylist())
-    if len(index) != n or not np.array_equal(np.sort(index), np.arange(n)):
-        raise UnlabelledDatasetError(
-            f"{path} labels {len(index)} frames, the dataset has {n}; expected each index 0..{n - 1} once. "
-            "It may belong to another dataset"
-        )
-    labels = np.full(n, UNLABELLED, np.int8)
-    labels[index] = _as_labels(failure, n, str(path))
-    return labels

@@ -11,6 +11,7 @@ from lerobot_latentsafe.evaluation.rollouts import wilson
 from lerobot_latentsafe.filter import FilterDecision, Reason
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.shield import BasePolicy
+from lerobot_latentsafe.world_models.base import Latent, select
 
 
 @dataclass
@@ -24,6 +25,7 @@ class Episodes:
         action_change: (n,) summed distance between executed and proposed action, robot units.
         traces: one dict of lists an episode: action, proposed, value, margin, intervened, reason, state.
         frames: RGB frames of the episodes asked for.
+        latents: the filter's latents (1, ...) at each step of those.
     """
 
     success: np.ndarray
@@ -33,6 +35,7 @@ class Episodes:
     action_change: np.ndarray
     traces: list[dict[str, list]] = field(default_factory=list)
     frames: list[list[np.ndarray]] = field(default_factory=list)
+    latents: list[list[Latent]] = field(default_factory=list)
 
     def rates(self) -> dict:
         """Shares with Wilson intervals; success means safe success."""
@@ -50,7 +53,8 @@ class Episodes:
     def joined(cls, parts: "list[Episodes]") -> "Episodes":
         arrays = ("success", "violation", "steps", "overridden", "action_change")
         joined = {name: np.concatenate([getattr(p, name) for p in parts]) for name in arrays}
-        return cls(**joined, traces=[t for p in parts for t in p.traces], frames=[f for p in parts for f in p.frames])
+        lists = {name: [x for p in parts for x in getattr(p, name)] for name in ("traces", "frames", "latents")}
+        return cls(**joined, **lists)
 
 
 def check_environment(policy: LatentSafePolicy, env: EnvConfig) -> None:
@@ -106,6 +110,7 @@ def _run_batch(actor: BasePolicy | LatentSafePolicy, env: EnvConfig, seeds: list
     traces: list[dict[str, list]] = [{} for _ in range(n)]
     _record(traces, ~done, state=np.asarray(info["state"]) if "state" in info else None)
     frames = [[frame] for frame in vector_env.call("render")[:n_videos]]
+    latents: list[list[Latent]] = [[] for _ in frames]
     while not done.all():
         batch = {**preprocess_observation(observation), "task": list(task)}
         action, decision = _act(actor, batch)
@@ -116,6 +121,8 @@ def _run_batch(actor: BasePolicy | LatentSafePolicy, env: EnvConfig, seeds: list
                 traces, alive, proposed=decision.proposed, value=decision.value, margin=decision.margin,
                 intervened=decision.intervened, reason=decision.reason,
             )  # fmt: skip
+            for i in np.flatnonzero(alive[:n_videos]):
+                latents[i].append(select(actor.shield.latent, slice(i, i + 1)))
             overridden += alive & decision.intervened.cpu().numpy()
             moved = (decision.action - decision.proposed).norm(dim=-1).nan_to_num(0.0).cpu().numpy()
             change += np.where(alive, moved, 0.0)
@@ -136,7 +143,7 @@ def _run_batch(actor: BasePolicy | LatentSafePolicy, env: EnvConfig, seeds: list
                 kept.append(frame)
         done |= over
     vector_env.close()
-    return Episodes(success & ~violation, violation, steps, overridden, change, traces, frames)
+    return Episodes(success & ~violation, violation, steps, overridden, change, traces, frames, latents)
 
 
 def _act(actor: BasePolicy | LatentSafePolicy, batch: dict) -> tuple[np.ndarray, FilterDecision | None]:

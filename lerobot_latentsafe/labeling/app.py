@@ -1,0 +1,285 @@
+"""The labelling page's server: a few fixed addresses behind a token, for one person's browser on the same machine.
+
+Nothing a browser sends is ever used as a path: episodes and cameras are numbers that are looked up, specifications are
+names that must be known already, and the page's own three files are read before the first request.
+"""
+
+import hmac
+import json
+import secrets
+import socket
+import struct
+import threading
+from collections import OrderedDict
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import JSONResponse, PlainTextResponse, Response
+from starlette.routing import Mount, Route
+
+from lerobot_latentsafe.labeling.frames import DatasetFrames
+from lerobot_latentsafe.labeling.store import ConflictError, LabelStore
+from lerobot_latentsafe.labeling.suggestions import Suggester, contradiction
+
+PAGE = Path(__file__).parent / "page"
+STATIC = {
+    "": ("index.html", "text/html"),
+    "page.js": ("page.js", "text/javascript"),
+    "page.css": ("page.css", "text/css"),
+}
+MAX_BODY = 4096
+KEPT_EPISODES = 24
+HEADERS = {
+    "Cache-Control": "no-store",
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+}
+
+
+class Guard:
+    """Lets through what comes from the page itself: right token, right host, right origin, small body.
+
+    Args:
+        hosts: names and addresses by which this server may be called; others are DNS rebinding.
+    """
+
+    def __init__(self, app, token: str, hosts: set[str]):
+        self.app, self.token, self.hosts = app, token, hosts
+
+    async def __call__(self, scope, receive, send):
+        if scope["type"] != "http":
+            return await self.app(scope, receive, send) if scope["type"] == "lifespan" else None
+        refusal = self._refusal(Request(scope))
+
+        async def send_guarded(message):
+            if message["type"] == "http.response.start":
+                message["headers"] = [
+                    *message["headers"],
+                    *((k.lower().encode(), v.encode()) for k, v in HEADERS.items()),
+                ]
+            await send(message)
+
+        if refusal is not None:
+            return await refusal(scope, receive, send_guarded)
+        await self.app(scope, receive, send_guarded)
+
+    def _refusal(self, request: Request) -> Response | None:
+        host, origin = request.headers.get("host", ""), request.headers.get("origin")
+        if _host_name(host) not in self.hosts:
+            return PlainTextResponse("wrong host", 403)
+        given = request.url.path.split("/")[1]
+        if not hmac.compare_digest(given.encode(errors="replace"), self.token.encode()):
+            return PlainTextResponse("open the address that latentsafe label printed", 403)
+        if origin is not None and urlsplit(origin).netloc != host:
+            return PlainTextResponse("wrong origin", 403)
+        if request.method not in ("GET", "HEAD"):
+            if origin is None or request.headers.get("sec-fetch-site", "same-origin") != "same-origin":
+                return PlainTextResponse("wrong origin", 403)
+            if request.headers.get("content-type") != "application/json":
+                return PlainTextResponse("expected application/json", 415)
+        return None
+
+
+def _host_name(host: str) -> str:
+    try:
+        return urlsplit(f"//{host}").hostname or ""
+    except ValueError:
+        return ""
+
+
+class LabelServer:
+    """The endpoints. `changes` is a log of episodes whose entry changed, which tabs poll."""
+
+    def __init__(self, store: LabelStore, frames: DatasetFrames, user: str, suggester: Suggester | None = None):
+        self.store, self.frames, self.user, self.suggester = store, frames, user, suggester
+        self.changes: list[tuple[str | None, int]] = []
+        self._packed: OrderedDict[tuple[int, int], bytes] = OrderedDict()
+        self._packing = threading.Lock()
+
+    def app(self, token: str, hosts: set[str]) -> Guard:
+        """The ASGI application."""
+        routes = [Route(f"/{name}", self._static(*file)) for name, file in STATIC.items()]
+        routes += [
+            Route("/api/dataset", self.dataset),
+            Route("/api/labels/{specification}", self.labels),
+            Route("/api/labels/{specification}", self.label, methods=["POST"]),
+            Route("/api/undo/{specification}", self.undo, methods=["POST"]),
+            Route("/api/frames/{camera:int}/{episode:int}", self.episode_frames),
+            Route("/api/margin/{episode:int}", self.margin),
+        ]
+        errors = {ConflictError: _refuse(409), OSError: _refuse(507), ValueError: _refuse(400)}
+        return Guard(Starlette(routes=[Mount(f"/{token}", routes=routes)], exception_handlers=errors), token, hosts)
+
+    @staticmethod
+    def _static(name: str, media_type: str):
+        content = (PAGE / name).read_bytes()
+        return lambda request: Response(content, media_type=media_type)
+
+    def dataset(self, request: Request) -> Response:
+        meta = self.frames.meta
+        return JSONResponse(
+            {
+                "repo_id": meta.repo_id,
+                "identity": self.store.identity,
+                "fps": meta.fps,
+                "cameras": self.frames.cameras,
+                "lengths": self.store.length.tolist(),
+                "tasks": [", ".join(tasks) for tasks in meta.episodes["tasks"]],
+                "specifications": self.store.specifications,
+                "user": self.user,
+                "suggestions": self.suggester is not None,
+            }
+        )
+
+    def labels(self, request: Request) -> Response:
+        """Entries of all episodes, or with ?since=n of those changed after the n-th change."""
+        specification, now = self._specification(request), len(self.changes)
+        since = request.query_params.get("since")
+        if since is None:
+            episodes = range(len(self.store))
+        else:
+            new = self.changes[_number(since, "since", now) : now]
+            episodes = sorted({episode for name, episode in new if name in (None, specification)})
+        return JSONResponse({"changes": now, "entries": [self._entry(specification, e) for e in episodes]})
+
+    async def label(self, request: Request) -> Response:
+        specification, asked = self._specification(request), await _body(request)
+        episode = _number(asked.get("episode"), "episode", len(self.store) - 1)
+        first = asked.get("first")
+        if first is not None:
+            first = _number(first, "first", int(self.store.length[episode]))
+        seen, tab = _number(asked.get("seen"), "seen", 2**53), _text(asked.get("tab"))
+        await run_in_threadpool(self.store.label, specification, episode, first, self.user, seen, tab)
+        return self._changed(specification, episode)
+
+    async def undo(self, request: Request) -> Response:
+        specification, tab = self._specification(request), _text((await _body(request)).get("tab"))
+        undone = await run_in_threadpool(self.store.undo, specification, tab)
+        return self._changed(specification, undone[0]) if undone else JSONResponse({"entry": None})
+
+    def episode_frames(self, request: Request) -> Response:
+        """All frames of one camera: the count, the size of each, then the pictures (little-endian uint32)."""
+        camera = _number(request.path_params["camera"], "camera", len(self.frames.cameras) - 1)
+        episode = _number(request.path_params["episode"], "episode", len(self.store) - 1)
+        return Response(self._pack(camera, episode), media_type="application/octet-stream")
+
+    def margin(self, request: Request) -> Response:
+        episode = _number(request.path_params["episode"], "episode", len(self.store) - 1)
+        known = self.suggester.known.get(episode) if self.suggester else None
+        return JSONResponse({"margin": None if known is None else [round(float(l), 3) for l in known.margin]})
+
+    def suggestion_arrived(self, episode: int) -> None:
+        self.changes.append((None, episode))
+
+    def _specification(self, request: Request) -> str:
+        name = request.path_params["specification"]
+        if name not in self.store.specifications:
+            raise HTTPException(404, f"unknown specification; expected one of {', '.join(self.store.specifications)}")
+        return name
+
+    def _changed(self, specification: str, episode: int) -> Response:
+        self.changes.append((specification, episode))
+        return JSONResponse({"entry": self._entry(specification, episode)})
+
+    def _entry(self, specification: str, episode: int) -> dict:
+        verdict = self.store.verdict(specification, episode)
+        entry = {"episode": episode, "first": verdict.first, "by": verdict.by, "at": verdict.at}
+        labels = self.store.labels(specification, episode)
+        if verdict.mixed:
+            entry["mixed"] = labels.tolist()
+        known = self.suggester.known.get(episode) if self.suggester else None
+        if known is not None:
+            entry |= {"guess": known.guess, "usefulness": round(known.usefulness, 3)}
+            entry |= {"contradiction": round(contradiction(known.margin, labels), 3)}
+        return entry
+
+    def _pack(self, camera: int, episode: int) -> bytes:
+        key = (camera, episode)
+        with self._packing:
+            if key not in self._packed:
+                pictures = self.frames.encoded(self.frames.cameras[camera], episode)
+                sizes = struct.pack(f"<{len(pictures) + 1}I", len(pictures), *map(len, pictures))
+                self._packed[key] = sizes + b"".join(pictures)
+                while len(self._packed) > KEPT_EPISODES * len(self.frames.cameras):
+                    self._packed.popitem(last=False)
+            self._packed.move_to_end(key)
+            return self._packed[key]
+
+
+async def _body(request: Request) -> dict:
+    content = b""
+    async for chunk in request.stream():
+        content += chunk
+        if len(content) > MAX_BODY:
+            raise HTTPException(413, f"expected at most {MAX_BODY} bytes")
+    try:
+        asked = json.loads(content)
+    except (ValueError, RecursionError) as e:
+        raise HTTPException(400, "expected JSON") from e
+    if not isinstance(asked, dict):
+        raise HTTPException(400, "expected a JSON object")
+    return asked
+
+
+def _number(value: object, name: str, largest: int) -> int:
+    """An integer in 0..largest from a path, a query or JSON."""
+    if isinstance(value, str) and value.isascii() and value.isdigit() and len(value) < 20:
+        value = int(value)
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= largest:
+        raise HTTPException(400, f"{name}: expected a whole number from 0 to {largest}")
+    return value
+
+
+def _text(value: object) -> str:
+    if not isinstance(value, str) or len(value) > 64:
+        raise HTTPException(400, "tab: expected a short text")
+    return value
+
+
+def _refuse(status: int):
+    return lambda request, error: JSONResponse({"error": str(error)}, status)
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A bound socket.
+
+    Raises:
+        OSError: the port is in use or the address is not this machine's.
+        ValueError: an address that names no interface.
+    """
+    if host in ("", "0.0.0.0", "::"):
+        raise ValueError(
+            f"--host={host} would take calls under any name; keep 127.0.0.1 and use an SSH tunnel, or give the one "
+            "address by which your browser reaches this machine"
+        )
+    listener = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((host, port))
+        listener.listen()
+    except (OSError, OverflowError) as e:
+        listener.close()
+        raise OSError(f"cannot listen on {host} port {port} ({e}); choose another --port (0 takes a free one)") from e
+    return listener
+
+
+def serve(server: LabelServer, listener: socket.socket) -> None:
+    """Serve until interrupted; prints the address to open."""
+    import uvicorn
+
+    host, port = listener.getsockname()[:2]
+    token, shown = secrets.token_urlsafe(16), f"[{host}]" if ":" in host else host
+    print(f"Label at http://{shown}:{port}/{token}/ (every key is saved; Ctrl-C stops)", flush=True)
+    loopback = {"127.0.0.1", "localhost", "::1"}
+    hosts = loopback if host in loopback else {host}
+    config = uvicorn.Config(server.app(token, hosts), log_level="warning", access_log=False, server_header=False)
+    uvicorn.Server(config).run(sockets=[listener])

@@ -1,0 +1,232 @@
+"""Labels without a person: plug-in functions that look at an episode and say where it fails.
+
+A labeller is any function `Episode -> first failing frame | labels of all frames | None for "cannot tell"`. One is
+named on the command line as `dubins_truth` (here) or `my_module:my_function`; `vision_language` asks a model.
+"""
+
+import base64
+import importlib
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from lerobot_latentsafe.datasets.labels import FAILING, SAFE, UNLABELLED
+from lerobot_latentsafe.labeling.frames import DatasetFrames
+from lerobot_latentsafe.labeling.store import LabelStore
+
+
+@dataclass(frozen=True)
+class Episode:
+    """What a labeller sees of one episode; nothing is decoded before it is asked for."""
+
+    number: int
+    length: int
+    task: str
+    frames: DatasetFrames
+
+    def column(self, name: str) -> np.ndarray:
+        """(T,) or (T, D) of a column.
+
+        Raises:
+            ValueError: the dataset has no such column.
+        """
+        if name not in self.frames.meta.features:
+            raise ValueError(
+                f"this labeller reads the column {name!r}, {self.frames.meta.repo_id} has "
+                f"{', '.join(self.frames.meta.features)}"
+            )
+        return self.frames.columns(self.number, [name])[name]
+
+    def images(self, camera: str) -> np.ndarray:
+        """uint8 (T, H, W, 3), RGB."""
+        return self.frames.images(camera, self.number)
+
+
+Labeller = Callable[[Episode], "int | np.ndarray | None"]
+
+
+def dubins_truth(episode: Episode) -> np.ndarray:
+    """Privileged simulation truth: the car fails where its recorded position is inside the disc."""
+    from lerobot_latentsafe.envs import dubins
+
+    position = episode.column("observation.environment_state")
+    return np.where(np.hypot(*position.T) < dubins.RADIUS, FAILING, SAFE)
+
+
+# -- a vision-language model ---
+
+PROMPT = """These are {shown} frames of one robot episode of {length} frames (camera {camera}), in order.
+Task: {task}
+Frame numbers, one a picture: {numbers}
+Does the episode fail in this sense: {failure}?
+Once it has failed, all later frames count as failing.
+Answer with one JSON object and nothing else: {{"fails": true, "first_failing_frame": <number>}}
+or {{"fails": false, "first_failing_frame": null}}.
+If you cannot tell, answer {{"fails": null, "first_failing_frame": null}}."""
+
+
+class AnswerError(ValueError):
+    """A model's answer that is not exactly what was asked for; it never becomes a label."""
+
+
+class Model(Protocol):
+    """A vision-language model."""
+
+    def __call__(self, prompt: str, pictures: list[np.ndarray]) -> str:
+        """Its answer to a prompt with RGB pictures (H, W, 3)."""
+
+
+@dataclass(frozen=True)
+class VisionLanguageLabeller:
+    """Shows a model some frames of each episode and takes its answer only if it is well formed.
+
+    Attributes:
+        model: whom to ask.
+        failure: what counts as a failure, in words.
+        camera: which one to show; None: the first.
+        n_frames: pictures an episode.
+    """
+
+    model: Model
+    failure: str
+    camera: str | None = None
+    n_frames: int = 12
+
+    def __call__(self, episode: Episode) -> int | None:
+        camera = self.camera or episode.frames.cameras[0]
+        numbers = np.unique(np.linspace(0, episode.length - 1, self.n_frames).round().astype(int))
+        prompt = PROMPT.format(
+            shown=len(numbers), length=episode.length, camera=camera, task=episode.task,
+            numbers=", ".join(map(str, numbers)), failure=self.failure,
+        )  # fmt: skip
+        return parse_answer(self.model(prompt, list(episode.images(camera)[numbers])), episode.length)
+
+
+def parse_answer(answer: str, length: int) -> int | None:
+    """First failing frame, the length for "never fails", None for "cannot tell".
+
+    Raises:
+        AnswerError: anything but exactly one of the three objects asked for.
+    """
+    try:
+        said = json.loads(answer)
+    except (ValueError, RecursionError) as e:
+        raise AnswerError(f"expected one JSON object, got {answer[:80]!r}") from e
+    if not isinstance(said, dict) or set(said) != {"fails", "first_failing_frame"}:
+        raise AnswerError(f"expected exactly fails and first_failing_frame, got {answer[:80]!r}")
+    fails, first = said["fails"], said["first_failing_frame"]
+    if fails is True and type(first) is int and 0 <= first < length:
+        return first
+    if first is None and fails is False:
+        return length
+    if first is None and fails is None:
+        return None
+    raise AnswerError(f"expected a frame from 0 to {length - 1} exactly where it fails, got {answer[:80]!r}")
+
+
+@dataclass(frozen=True)
+class ChatEndpoint:
+    """A model behind an OpenAI-style chat endpoint, as vLLM, Ollama, llama.cpp and most services offer.
+
+    Attributes:
+        url: ends in /v1. model: its name there. key: the service's key, if it wants one.
+    """
+
+    url: str
+    model: str
+    key: str | None = None
+    timeout_s: float = 120.0
+
+    def __call__(self, prompt: str, pictures: list[np.ndarray]) -> str:
+        import httpx
+
+        images = [{"type": "image_url", "image_url": {"url": _data_url(picture)}} for picture in pictures]
+        content = [{"type": "text", "text": prompt}, *images]
+        asked = {"model": self.model, "temperature": 0, "messages": [{"role": "user", "content": content}]}
+        headers = {"Authorization": f"Bearer {self.key}"} if self.key else {}
+        try:
+            reply = httpx.post(f"{self.url}/chat/completions", json=asked, headers=headers, timeout=self.timeout_s)
+            reply.raise_for_status()
+            answer = reply.json()["choices"][0]["message"]["content"]
+        except httpx.HTTPError as e:
+            raise ConnectionError(f"{self.url} did not answer ({type(e).__name__}: {e})") from e
+        except (KeyError, IndexError, TypeError, ValueError) as e:
+            raise AnswerError(f"{self.url} does not speak the chat protocol ({e!r})") from e
+        if not isinstance(answer, str):
+            raise AnswerError(f"{self.url} answered {type(answer).__name__}, expected text")
+        return answer
+
+
+def _data_url(picture: np.ndarray) -> str:
+    encoded = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))[1].tobytes()
+    return f"data:image/jpeg;base64,{base64.b64encode(encoded).decode()}"
+
+
+# -- running one ---
+
+
+def find_labeller(name: str) -> Labeller:
+    """A labeller of this module, or `module:function`.
+
+    Raises:
+        ValueError: there is none of that name.
+    """
+    if name == "dubins_truth":
+        return dubins_truth
+    module, _, function = name.partition(":")
+    try:
+        return getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError, ValueError) as e:
+        raise ValueError(
+            f"no labeller {name!r} ({e}); expected dubins_truth, vision_language, or module:function"
+        ) from e
+
+
+def label_automatically(
+    store: LabelStore, frames: DatasetFrames, specification: str, labeller: Labeller, name: str
+) -> dict[str, list]:
+    """Ask a labeller about every episode that has no label yet, and save what it says; people's labels stay.
+
+    Returns:
+        labelled: episodes; undecided: episodes; refused: (episode, why) of answers that were no labels.
+    """
+    from tqdm import tqdm
+
+    open_episodes = [e for e in range(len(store)) if (store.labels(specification, e) == UNLABELLED).all()]
+    found, result = {}, {"labelled": [], "undecided": [], "refused": []}
+    for number in tqdm(open_episodes, desc=name, unit="episode"):
+        length = int(store.length[number])
+        episode = Episode(number, length, ", ".join(frames.meta.episodes[number]["tasks"]), frames)
+        try:
+            said = labeller(episode)
+            if said is None:
+                result["undecided"].append(number)
+                continue
+            found[number] = as_vector(said, length)
+        except AnswerError as e:
+            result["refused"].append((number, str(e)))
+            continue
+        result["labelled"].append(number)
+    if found:
+        store.label_frames(specification, found, f"auto {name}")
+    return result
+
+
+def as_vector(said: "int | np.ndarray", length: int) -> np.ndarray:
+    """int8 labels (T,) from a first failing frame or from labels.
+
+    Raises:
+        AnswerError: neither.
+    """
+    if np.ndim(said) == 0:
+        if not isinstance(said, int | np.integer) or isinstance(said, bool) or not 0 <= said <= length:
+            raise AnswerError(f"expected a frame from 0 to {length} or {length} labels, got {said!r}")
+        return np.where(np.arange(length) < said, SAFE, FAILING).astype(np.int8)
+    vector = np.asarray(said)
+    if vector.shape != (length,) or not np.isin(vector, (FAILING, SAFE, UNLABELLED)).all():
+        raise AnswerError(f"expected {length} labels of 1, 0 or -1, got shape {vector.shape}")
+    return vector.astype(np.int8)

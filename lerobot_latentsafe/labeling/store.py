@@ -1,0 +1,248 @@
+"""The labels of one dataset while people work on them: in memory, and on disk after every key.
+
+A verdict on an episode is one number, the first failing frame (all later frames fail); the episode's length means that
+it never fails, None that nobody has said. Every state of an episode carries the time it was set, in microseconds: a
+change names the state it was made on, so that two tabs cannot overwrite each other unseen.
+"""
+
+import threading
+import time
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from filelock import FileLock, Timeout
+
+from lerobot_latentsafe.datasets.labels import (
+    FAILING,
+    FOLDER,
+    SAFE,
+    UNLABELLED,
+    Sidecar,
+    UnlabelledDatasetError,
+    _as_labels,
+    identity,
+    read_frames,
+    sidecar_path,
+    specifications_of,
+)
+
+UNDO_DEPTH = 1000
+
+
+class ConflictError(RuntimeError):
+    """Somebody else changed the episode meanwhile."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What is known about one episode.
+
+    Attributes:
+        first: first failing frame; the length if it never fails; None if unlabelled or mixed.
+        mixed: labels that are not "safe, then failing" (from a column or another tool).
+        by: who said so. at: when, microseconds since 1970 UTC; 0 before anybody did.
+    """
+
+    first: int | None
+    mixed: bool
+    by: str | None
+    at: int
+
+
+class LabelStore:
+    """All specifications of one dataset.
+
+    Args:
+        root: the dataset's folder; labels go to `labels/` in it.
+        repo_id: its id, written into label files.
+        specifications: names to offer besides those that have a file already.
+
+    Raises:
+        LabelFileError: a file of another dataset or schema, or an unusable name; nothing is touched.
+        OSError: the folder cannot be written, or another process labels this dataset.
+    """
+
+    def __init__(self, root: str | Path, repo_id: str, specifications: list[str]):
+        self.root, self.repo_id = Path(root), repo_id
+        paths = {name: sidecar_path(root, name) for name in (*specifications, *specifications_of(root))}
+        self.frames = read_frames(root, ["action", *paths])
+        self.identity = identity(self.frames, len(self.frames["index"]))
+        self.start, self.length = _episode_spans(self.frames)
+        self._lock = threading.RLock()
+        self._undo: dict[tuple[str, str], list] = defaultdict(list)
+        self._files = {name: self._open(name, path) for name, path in paths.items()}
+        self._guard = self._own_folder()
+
+    @property
+    def specifications(self) -> list[str]:
+        return list(self._files)
+
+    def __len__(self) -> int:
+        return len(self.length)
+
+    def _open(self, name: str, path: Path) -> Sidecar:
+        if path.exists():
+            return Sidecar.read(path, self.frames)
+        sidecar = Sidecar.empty(len(self.frames["index"]))
+        if name in self.frames:
+            # What the dataset says already is where labelling starts.
+            sidecar.failure = _as_labels(self.frames[name], len(sidecar.failure), f"column {name!r} of {self.root}")
+            sidecar.names, sidecar.by[sidecar.failure != UNLABELLED] = [f"column {name}"], 0
+        return sidecar
+
+    def _own_folder(self) -> FileLock:
+        """Make `labels/`, prove that it can be written, and keep other processes out."""
+        folder = self.root / FOLDER
+        try:
+            folder.mkdir(exist_ok=True)
+            for torn in folder.glob(".*.partial"):
+                torn.unlink()
+            probe = folder / ".probe"
+            probe.write_bytes(b"")
+            probe.unlink()
+            lock = FileLock(folder / ".lock")
+            lock.acquire(timeout=0)
+        except Timeout:
+            raise OSError(
+                f"another process is labelling {self.root} already; close it, or use its page in another tab"
+            ) from None
+        except OSError as e:
+            raise OSError(
+                f"cannot write labels to {folder} ({e.strerror or e}); make it writable, or copy the dataset to a "
+                "folder of your own. Nothing was changed"
+            ) from e
+        return lock
+
+    def close(self) -> None:
+        """Let other processes label."""
+        self._guard.release()
+
+    def verdict(self, specification: str, episode: int) -> Verdict:
+        """What is known about an episode."""
+        sidecar, span = self._files[specification], self._span(episode)
+        failure, by = sidecar.failure[span], sidecar.by[span.start]
+        first = first_failing(failure)
+        mixed = first is None and bool((failure != UNLABELLED).any())
+        return Verdict(first, mixed, sidecar.names[by] if by >= 0 else None, int(sidecar.at[span.start]))
+
+    def labels(self, specification: str, episode: int) -> np.ndarray:
+        """int8 (T,), 1 failing, 0 safe, -1 unlabelled."""
+        return self._files[specification].failure[self._span(episode)].copy()
+
+    def label(
+        self, specification: str, episode: int, first: int | None, by: str, seen: int | None = None, tab: str = ""
+    ) -> Verdict:
+        """Set a verdict and save. It is on disk when this returns.
+
+        Args:
+            first: first failing frame, the episode's length for "never fails", None to clear.
+            seen: `at` of the state this was decided on; None overwrites whatever is there.
+            tab: whose undo it goes to.
+
+        Raises:
+            ConflictError: the state is no longer the one seen.
+            OSError: not saved (disk full, folder gone); the labels are as before, in memory and on disk.
+        """
+        length = int(self.length[episode])
+        if first is not None and not 0 <= first <= length:
+            raise ValueError(f"first failing frame is {first}; expected 0 to {length} ({length}: never fails)")
+        failure = np.full(length, UNLABELLED, np.int8)
+        if first is not None:
+            failure[:first], failure[first:] = SAFE, FAILING
+        with self._lock:
+            now = self.verdict(specification, episode)
+            if seen is not None and seen != now.at:
+                if now.first == first and not now.mixed:
+                    return now  # saved before, and only the answer was lost
+                raise ConflictError(f"episode {episode} was changed by {now.by or 'somebody'} meanwhile")
+            before = self._state(specification, episode)
+            after = self._write(specification, episode, (failure, by if first is not None else None, None))
+            stack = self._undo[specification, tab]
+            stack.append((episode, before, after.at))
+            del stack[:-UNDO_DEPTH]
+            return after
+
+    def label_frames(self, specification: str, failure: dict[int, np.ndarray], by: str) -> None:
+        """Save whole label vectors of many episodes at once, as automatic labellers make them."""
+        with self._lock:
+            sidecar = self._files[specification]
+            saved = [array.copy() for array in (sidecar.failure, sidecar.by, sidecar.at)]
+            try:
+                for episode, vector in failure.items():
+                    self._put(sidecar, episode, (vector, by, None))
+                self._save(specification)
+            except BaseException:
+                sidecar.failure, sidecar.by, sidecar.at = saved
+                raise
+
+    def undo(self, specification: str, tab: str = "") -> tuple[int, Verdict] | None:
+        """Take back the tab's last change; None if there is none.
+
+        Raises:
+            ConflictError: the episode was changed by somebody else since.
+        """
+        with self._lock:
+            if not self._undo[specification, tab]:
+                return None
+            episode, before, after_at = self._undo[specification, tab].pop()
+            now = self.verdict(specification, episode)
+            if now.at != after_at:
+                raise ConflictError(f"episode {episode} was changed by {now.by or 'somebody'} since; not undone")
+            try:
+                return episode, self._write(specification, episode, before)
+            except OSError:
+                self._undo[specification, tab].append((episode, before, after_at))
+                raise
+
+    def _span(self, episode: int) -> slice:
+        return slice(int(self.start[episode]), int(self.start[episode] + self.length[episode]))
+
+    def _state(self, specification: str, episode: int) -> tuple[np.ndarray, str | None, int]:
+        now = self.verdict(specification, episode)
+        return self.labels(specification, episode), now.by, now.at
+
+    def _write(self, specification: str, episode: int, state: tuple) -> Verdict:
+        """Set an episode's state and save; on failure, everything is as before."""
+        sidecar, before = self._files[specification], self._state(specification, episode)
+        self._put(sidecar, episode, state)
+        try:
+            self._save(specification)
+        except BaseException:
+            self._put(sidecar, episode, before)
+            raise
+        return self.verdict(specification, episode)
+
+    def _put(self, sidecar: Sidecar, episode: int, state: tuple[np.ndarray, str | None, int | None]) -> None:
+        failure, by, at = state
+        span = self._span(episode)
+        if by is not None and by not in sidecar.names:
+            sidecar.names.append(by)
+        sidecar.failure[span] = failure
+        sidecar.by[span] = sidecar.names.index(by) if by is not None else -1
+        # A new state has a time of its own even if the clock stands still or was set back.
+        sidecar.at[span] = max(time.time_ns() // 1000, int(sidecar.at.max()) + 1) if at is None else at
+
+    def _save(self, specification: str) -> None:
+        path = sidecar_path(self.root, specification)
+        self._files[specification].write(path, self.repo_id, self.identity)
+
+
+def first_failing(failure: np.ndarray) -> int | None:
+    """First failing frame of labels (T,); T if all are safe; None if unlabelled or not "safe, then failing"."""
+    first = int((failure == SAFE).sum())
+    ordered = (failure[:first] == SAFE).all() and (failure[first:] == FAILING).all()
+    return first if ordered else None
+
+
+def _episode_spans(frames: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """First frame index and length of each episode."""
+    episode = frames["episode_index"]
+    start = np.flatnonzero(np.r_[True, episode[1:] != episode[:-1]])
+    if not np.array_equal(episode[start], np.arange(len(start))):
+        raise UnlabelledDatasetError(
+            f"episodes are numbered {episode[start][:5].tolist()}...; expected 0, 1, 2, ...: an episode file is "
+            "missing. Download or restore the whole dataset"
+        )
+    return start, np.diff(np.r_[start, len(episode)])

@@ -1,0 +1,144 @@
+import json
+import shutil
+import threading
+from http.server import BaseHTTPRequestHandler, HTTPServer
+
+import numpy as np
+import pytest
+import tiny
+
+from lerobot_latentsafe.cli import main
+from lerobot_latentsafe.datasets.labels import FailureLabels
+from lerobot_latentsafe.envs import dubins
+from lerobot_latentsafe.labeling.automatic import (
+    AnswerError,
+    ChatEndpoint,
+    VisionLanguageLabeller,
+    as_vector,
+    dubins_truth,
+    find_labeller,
+    label_automatically,
+    parse_answer,
+)
+from lerobot_latentsafe.labeling.frames import DatasetFrames
+from lerobot_latentsafe.labeling.store import LabelStore
+
+
+@pytest.fixture(scope="module")
+def reckless(tmp_path_factory):
+    """Episodes that enter the disc, with the recorded position."""
+    from lerobot_latentsafe.datasets.collect import collect_dubins
+
+    root = tmp_path_factory.mktemp("reckless") / "car"
+    collect_dubins("reckless", tiny.REPO_ID, root, n_episodes=4, seed=0)
+    return root
+
+
+@pytest.fixture
+def root(reckless, tmp_path):
+    return shutil.copytree(reckless, tmp_path / "car")
+
+
+@pytest.fixture
+def labelled(root):
+    store, frames = LabelStore(root, tiny.REPO_ID, ["entered"]), DatasetFrames(tiny.metadata(root))
+    yield lambda labeller: label_automatically(store, frames, "entered", labeller, "test"), store
+    store.close()
+
+
+@pytest.fixture
+def model():
+    """A chat endpoint on this machine: answers with what the test says, keeps what it was asked."""
+
+    class Handler(BaseHTTPRequestHandler):
+        asked, answers = [], ['{"fails": true, "first_failing_frame": 3}']
+
+        def do_POST(self):
+            self.asked.append(json.loads(self.rfile.read(int(self.headers["content-length"]))))
+            answer = self.answers[min(len(self.asked), len(self.answers)) - 1]
+            self.send_response(200)
+            self.end_headers()
+            self.wfile.write(json.dumps({"choices": [{"message": {"content": answer}}]}).encode())
+
+        def log_message(self, *args):
+            pass
+
+    server = HTTPServer(("127.0.0.1", 0), Handler)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    Handler.url = f"http://127.0.0.1:{server.server_port}/v1"
+    yield Handler
+    server.shutdown()
+
+
+def test_simulation_truth_equals_the_recorded_labels(root, capsys):
+    column = FailureLabels.load(root).failure
+    main(["auto-label", "--labeller=dubins_truth", f"--dataset.repo_id={tiny.REPO_ID}", f"--dataset.root={root}",
+          "--specification=entered"])  # fmt: skip
+    assert "labelled   4 episodes" in capsys.readouterr().out
+    assert np.array_equal(FailureLabels.load(root, "entered").failure, column) and dubins.RADIUS == 0.5
+
+
+def test_labels_of_people_stay(labelled):
+    run, store = labelled
+    said = store.label("entered", 2, 0, "ann")
+    assert run(dubins_truth)["labelled"] == [0, 1, 3]
+    assert store.verdict("entered", 2) == said and store.verdict("entered", 1).by == "auto test"
+
+
+def test_labeller_without_its_column_says_so(dataset_root, tmp_path):
+    root = shutil.copytree(dataset_root, tmp_path / "car")
+    store, frames = LabelStore(root, tiny.REPO_ID, ["entered"]), DatasetFrames(tiny.metadata(root))
+    with pytest.raises(ValueError, match=r"reads the column 'observation.environment_state'.*observation.image"):
+        label_automatically(store, frames, "entered", dubins_truth, "test")
+
+
+def test_a_model_sees_pictures_and_task(labelled, model):
+    run, store = labelled
+    model.answers = [
+        '{"fails": true, "first_failing_frame": 3}',
+        '{"fails": false, "first_failing_frame": null}',
+        '{"fails": null, "first_failing_frame": null}',
+        "The car fails at frame 3.",
+    ]
+    result = run(VisionLanguageLabeller(ChatEndpoint(model.url, "stand-in"), "the car enters the red disc", n_frames=5))
+    assert [result[key] for key in ("labelled", "undecided")] == [[0, 1], [2]] and result["refused"][0][0] == 3
+    assert [store.verdict("entered", e).first for e in range(4)] == [3, store.length[1], None, None]
+    text, *pictures = model.asked[0]["messages"][0]["content"]
+    assert "the car enters the red disc" in text["text"] and "drive" in text["text"] and len(pictures) == 5
+    assert f"{store.length[0] - 1}\n" in text["text"]
+
+
+@pytest.mark.parametrize(
+    "answer",
+    ["", "3", "null", "[]", '{"fails": true}', '{"fails": true, "first_failing_frame": null}',
+     '{"fails": true, "first_failing_frame": 10}', '{"fails": true, "first_failing_frame": -1}',
+     '{"fails": true, "first_failing_frame": 2.0}', '{"fails": true, "first_failing_frame": true}',
+     '{"fails": 1, "first_failing_frame": 3}', '{"fails": false, "first_failing_frame": 3}',
+     '{"fails": "no", "first_failing_frame": null}', '{"fails": 0, "first_failing_frame": null}',
+     '{"fails": false, "first_failing_frame": null, "why": "x"}', '```json\n{"fails": false}\n```',
+     '{"fails": false, "first_failing_frame": null} I think', "[" * 100_000],
+)  # fmt: skip
+def test_what_is_not_exactly_an_answer_is_no_label(answer):
+    with pytest.raises(AnswerError):
+        parse_answer(answer, 10)
+
+
+def test_model_that_is_not_there_is_a_message():
+    with pytest.raises(ConnectionError, match=r"127.0.0.1:9/v1 did not answer"):
+        ChatEndpoint("http://127.0.0.1:9/v1", "x")("prompt", [])
+
+
+@pytest.mark.parametrize("said", [-1, 11, 2.5, True, "3", [0, 1], [2] * 10], ids=str)
+def test_what_a_function_returns_is_checked(said):
+    with pytest.raises(AnswerError):
+        as_vector(said, 10)
+
+
+@pytest.mark.parametrize("name", ["no_such", "no.module:f", "json:no_such", ":"])
+def test_unknown_labeller_is_a_message(name):
+    with pytest.raises(ValueError, match="expected dubins_truth, vision_language, or module:function"):
+        find_labeller(name)
+
+
+def test_your_own_function_is_found():
+    assert find_labeller("json:loads") is json.loads

@@ -1,0 +1,214 @@
+"""The page's server: what it answers, what it refuses, and that nothing sent to it goes anywhere."""
+
+import random
+import shutil
+import socket
+import string
+import struct
+
+import cv2
+import numpy as np
+import pytest
+import tiny
+
+pytest.importorskip("starlette", reason="needs the label extra")
+from starlette.testclient import TestClient
+
+from lerobot_latentsafe.labeling import app as app_module
+from lerobot_latentsafe.labeling.app import LabelServer, listen
+from lerobot_latentsafe.labeling.frames import DatasetFrames
+from lerobot_latentsafe.labeling.store import LabelStore
+
+TOKEN, HOST = "right-token", "http://127.0.0.1:8765"
+POST = {"origin": HOST, "content-type": "application/json"}
+
+
+@pytest.fixture
+def root(dataset_root, tmp_path):
+    return shutil.copytree(dataset_root, tmp_path / "car")
+
+
+@pytest.fixture
+def server(root):
+    store = LabelStore(root, tiny.REPO_ID, ["spilled", "failure"])
+    yield LabelServer(store, DatasetFrames(tiny.metadata(root)), "ann")
+    store.close()
+
+
+@pytest.fixture
+def client(server):
+    app = server.app(TOKEN, {"127.0.0.1", "localhost"})
+    return TestClient(app, base_url=HOST, raise_server_exceptions=False)
+
+
+def ask(client, path, **options):
+    return client.get(f"/{TOKEN}/{path}", **options)
+
+
+def say(client, path="api/labels/spilled", headers=POST, **body):
+    return client.post(f"/{TOKEN}/{path}", headers=headers, json=body)
+
+
+def label(client, episode, first, seen=0, tab="t"):
+    return say(client, episode=episode, first=first, seen=seen, tab=tab)
+
+
+@pytest.mark.parametrize("name", ["", "page.js", "page.css"])
+def test_page_is_served_with_a_strict_policy(client, name):
+    answer = ask(client, name)
+    assert answer.status_code == 200 and "default-src 'none'" in answer.headers["content-security-policy"]
+    assert answer.headers["referrer-policy"] == "no-referrer" and answer.headers["cache-control"] == "no-store"
+
+
+def test_page_needs_nothing_from_the_network():
+    for file in app_module.PAGE.iterdir():
+        assert "http://" not in file.read_text() and "https://" not in file.read_text()
+
+
+def test_dataset_names_what_the_page_shows(client, server):
+    told = ask(client, "api/dataset").json()
+    assert told["specifications"] == ["spilled", "failure"] and told["cameras"] == ["observation.image"]
+    assert told["lengths"] == server.store.length.tolist() and told["user"] == "ann"
+
+
+def test_label_undo_and_changes(client, server):
+    since = ask(client, "api/labels/spilled").json()["changes"]
+    entry = label(client, 3, 2).json()["entry"]
+    assert (entry["episode"], entry["first"], entry["by"]) == (3, 2, "ann")
+    news = ask(client, f"api/labels/spilled?since={since}").json()
+    assert news["entries"] == [entry] and news["changes"] == since + 1
+    assert say(client, "api/undo/spilled", tab="t").json()["entry"]["first"] is None
+    assert say(client, "api/undo/spilled", tab="t").json()["entry"] is None
+
+
+def test_two_tabs_cannot_overwrite_each_other_unseen(client):
+    assert label(client, 3, 2).status_code == 200
+    answer = label(client, 3, 4)
+    assert answer.status_code == 409 and "changed by ann" in answer.json()["error"]
+
+
+def test_frames_of_an_episode_are_its_pictures(client, server):
+    content = ask(client, "api/frames/0/2").content
+    (n,) = struct.unpack_from("<I", content)
+    sizes = struct.unpack_from(f"<{n}I", content, 4)
+    assert n == server.store.length[2] and len(content) == 4 * (n + 1) + sum(sizes)
+    last = cv2.imdecode(np.frombuffer(content[-sizes[-1] :], np.uint8), cv2.IMREAD_COLOR)
+    assert np.array_equal(last[..., ::-1], server.frames.images("observation.image", 2)[-1])
+
+
+def test_disk_that_is_full_is_told(client, server, monkeypatch):
+    def full(*args):
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(server.store, "_save", full)
+    answer = label(client, 3, 2)
+    assert answer.status_code == 507 and "No space left" in answer.json()["error"]
+
+
+@pytest.mark.parametrize("token", ["", "wrong", "right-toke", "right-token2", "%2e%2e", "right%2Dtoken/../wrong"])
+def test_wrong_token_is_refused(client, token):
+    assert client.get(f"/{token}/api/dataset").status_code in (403, 404)
+    assert client.post(f"/{token}/api/undo/spilled", headers=POST, json={"tab": "t"}).status_code in (403, 404)
+
+
+@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example", "", "[::1", "169.254.0.1:8765"])
+def test_other_names_of_this_machine_are_refused(client, host):
+    """A name that resolves to 127.0.0.1 must not give a foreign page access (DNS rebinding)."""
+    assert ask(client, "api/dataset", headers={"host": host}).status_code in (400, 403)
+
+
+@pytest.mark.parametrize(
+    "origin", ["https://evil.example", "null", "http://127.0.0.1:9999", "http://127.0.0.1:8765.evil"]
+)
+def test_other_origins_are_refused(client, server, origin):
+    assert say(client, headers=POST | {"origin": origin}, episode=3, first=2, seen=0, tab="t").status_code == 403
+    assert ask(client, "api/dataset", headers={"origin": origin}).status_code == 403
+    assert server.store.verdict("spilled", 3).first is None
+
+
+def test_writing_needs_an_origin_and_json(client):
+    body = dict(episode=3, first=2, seen=0, tab="t")
+    assert say(client, headers={"content-type": "application/json"}, **body).status_code == 403
+    assert say(client, headers=POST | {"sec-fetch-site": "cross-site"}, **body).status_code == 403
+    assert say(client, headers=POST | {"content-type": "text/plain"}, **body).status_code == 415
+
+
+@pytest.mark.parametrize(
+    "body",
+    [{}, {"episode": -1}, {"episode": 10**9}, {"episode": 3.0}, {"episode": True, "first": 0},
+     {"episode": 3, "first": "x"}, {"episode": 3, "first": 10**30}, {"episode": 3, "first": [1]},
+     {"episode": 3, "first": 1, "seen": -1}, {"episode": 3, "first": 1, "seen": 0, "tab": "x" * 99},
+     {"episode": "../../etc/passwd", "first": 1, "seen": 0, "tab": "t"}],
+    ids=str,
+)  # fmt: skip
+def test_bad_bodies_are_refused(client, server, body):
+    body = {"episode": 3, "first": 1, "seen": 0, "tab": "t"} | body if body else body
+    assert say(client, **body).status_code == 400
+    assert server.store.verdict("spilled", 3).first is None
+
+
+def test_large_bodies_are_cut_off(client):
+    assert say(client, episode=3, first=1, seen=0, tab="x" * 10_000).status_code == 413
+
+
+PIECES = ["..", "%2e%2e", "%2f", "%5c", "/", "//", "\\", "etc/passwd", "api", "labels", "frames", "margin", "undo",
+          "dataset", "spilled", "failure", "spilled.parquet", "labels/spilled.parquet", "meta/info.json", "page.js",
+          "0", "1", "-1", "99999999999999999999", "1e3", "0x1", "%00", "\u0661", "?since=-1", "?since=x", "#", ";", "~",
+          "C:", "file:", "%c0%ae", TOKEN]  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_fuzzed_addresses_and_bodies_touch_no_file(client, server, root, seed, monkeypatch):
+    """Whatever is sent: no server error, no file outside of the dataset opened, nothing but labels written."""
+    opened, rng = [], random.Random(seed)
+    monkeypatch.setattr("builtins.open", lambda file, *a, **k: opened.append(file))
+    monkeypatch.setattr("pathlib.Path.open", lambda self, *a, **k: opened.append(self))
+    monkeypatch.setattr("pathlib.Path.read_bytes", lambda self: opened.append(self))
+    monkeypatch.setattr(server.store, "_save", lambda name: None)
+    before = sorted(str(p) for p in root.rglob("*"))
+    for _ in range(250):
+        pieces = [rng.choice(PIECES) for _ in range(rng.randrange(1, 6))]
+        if rng.random() < 0.3:
+            pieces.append("".join(rng.choices(string.printable.strip().replace("#", ""), k=12)))
+        path = rng.choice(["", "api/", "api/labels/", "api/frames/0/", "api/undo/"]) + rng.choice(["/", ""]).join(
+            pieces
+        )
+        body = rng.choice(
+            [rng.randbytes(rng.randrange(200)), b"[" * 3000, b'{"episode": 1e999, "tab": "t"}', b'"\\ud800"', b"{}",
+             b'{"episode": 3, "first": NaN, "seen": 0, "tab": "t"}', b'{"tab": "../../x"}']
+        )  # fmt: skip
+        try:
+            answers = [client.get(f"/{TOKEN}/{path}"), client.post(f"/{TOKEN}/{path}", headers=POST, content=body)]
+        except (ValueError, UnicodeError):
+            continue  # the client itself cannot send this
+        except Exception as e:
+            assert type(e).__module__.startswith("httpx"), e
+            continue
+        assert all(answer.status_code < 500 for answer in answers), (path, body, [a.text for a in answers])
+    assert not opened and sorted(str(p) for p in root.rglob("*")) == before
+
+
+def test_port_in_use_is_a_message():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        with pytest.raises(OSError, match=r"cannot listen on 127.0.0.1 port .*choose another --port"):
+            listen("127.0.0.1", taken.getsockname()[1])
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", ""])
+def test_every_interface_at_once_is_refused(host):
+    with pytest.raises(ValueError, match="SSH tunnel"):
+        listen(host, 0)
+
+
+def test_dataset_without_cameras_is_a_message(cache_meta):
+    with pytest.raises(ValueError, match=r"no video and no images.*cache"):
+        DatasetFrames(cache_meta)
+
+
+def test_missing_file_of_an_episode_is_a_message(root):
+    meta = tiny.metadata(root)
+    next((root / "data").glob("*/*.parquet")).unlink()
+    with pytest.raises(FileNotFoundError, match=r"file-000.parquet is missing, which holds episode 0"):
+        DatasetFrames(meta)

@@ -1,0 +1,229 @@
+"""The labelling page in a real browser: Debian's Chromium, driven by Playwright."""
+
+import contextlib
+import os
+import re
+import runpy
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import tiny
+
+pytest.importorskip("starlette", reason="needs the label extra")
+sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright (the dev extra)")
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
+
+SERVER = """
+import sys
+from lerobot_latentsafe.cli import main
+main(["label", *sys.argv[1:]])
+"""
+
+
+class Server:
+    """`latentsafe label` as a process."""
+
+    def __init__(self, root, port=0):
+        command = [sys.executable, "-c", SERVER, f"--dataset.repo_id={tiny.REPO_ID}", f"--dataset.root={root}"]
+        self.process = subprocess.Popen(
+            [*command, "--specifications=[spilled,dropped]", f"--port={port}", "--user=ann"],
+            stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        self.address = re.search(r"http://\S+/", self._line()).group()
+        self.port = int(self.address.split(":")[2].split("/")[0])
+
+    def _line(self):
+        while line := self.process.stdout.readline():
+            if "http://" in line:
+                return line
+        raise AssertionError("latentsafe label stopped before it listened")
+
+    def kill(self):
+        os.kill(self.process.pid, signal.SIGKILL)
+        self.process.wait()
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory):
+    """12 episodes of two small cameras."""
+    root = tmp_path_factory.mktemp("filmed") / "cup"
+    film = runpy.run_path(str(Path(__file__).parents[1] / "scripts" / "bench_labeling.py"))["film"]
+    film(root, 12, size=64, repo_id=tiny.REPO_ID)
+    return root
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with sync_api.sync_playwright() as playwright:
+        opened = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield opened
+        opened.close()
+
+
+@pytest.fixture(scope="module")
+def server(filmed):
+    started = Server(filmed)
+    yield started
+    started.kill()
+
+
+def verdicts(server, specification):
+    """First failing frames as the server has them."""
+    import httpx
+
+    entries = httpx.get(f"{server.address}api/labels/{specification}").json()["entries"]
+    return [entry["first"] for entry in entries]
+
+
+@contextlib.contextmanager
+def opened(browser, address, context=None):
+    page = (context or browser.new_context(viewport={"width": 1366, "height": 768})).new_page()
+    errors = []
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.goto(address)
+    page.wait_for_selector("#view[data-ready]")
+    yield page
+    assert not errors
+    page.close()
+
+
+def shown(page):
+    """The episode on the screen, once its picture is there."""
+    page.wait_for_function("() => view.dataset.shown?.split(':')[0] === view.dataset.episode")
+    return int(page.get_attribute("#view", "data-episode"))
+
+
+def press(page, *keys):
+    for key in keys:
+        shown(page)
+        page.wait_for_timeout(60)
+        page.keyboard.press(key)
+
+
+def saved(page):
+    page.wait_for_function("() => document.getElementById('saved').textContent.startsWith('saved')")
+
+
+def test_ten_episodes_by_keyboard_reload_and_undo(server, browser):
+    with opened(browser, server.address) as page:
+        expected = {}
+        for i in range(10):
+            episode = shown(page)
+            press(page, *["ArrowRight"] * i, "f" if i % 2 else "s")
+            expected[episode] = i if i % 2 else None
+        saved(page)
+        assert list(expected) == list(range(10))  # the next open one, each time
+        first = verdicts(server, "spilled")
+        assert all(first[e] == f for e, f in expected.items() if f is not None) and first[10:] == [None, None]
+        assert "10 of 12" in page.inner_text("#progress")
+        page.reload()
+        page.wait_for_selector("#view[data-ready]")
+        assert shown(page) == 10 and "10 of 12" in page.inner_text("#progress")
+        press(page, "z")
+        page.wait_for_function("() => view.dataset.episode === '9' && view.dataset.verdict === 'open'")
+        press(page, "z")
+        page.wait_for_function("() => view.dataset.episode === '8' && view.dataset.verdict === 'open'")
+        assert verdicts(server, "spilled")[8:] == [None] * 4
+        assert verdicts(server, "dropped") == [None] * 12
+
+
+def test_cameras_stay_in_step_while_moving(server, browser):
+    with opened(browser, server.address) as page:
+        shown(page)
+        page.keyboard.press("Home")
+        for _ in range(15):
+            page.keyboard.press("ArrowRight")
+        page.keyboard.press("Shift+ArrowRight")
+        page.wait_for_function("() => view.dataset.shown?.endsWith(':25')")
+        assert "frame 25 of" in page.inner_text("#frame")
+        box = page.locator("#timeline").bounding_box()
+        page.mouse.click(box["x"] + 1, box["y"] + 10)
+        page.wait_for_function("() => view.dataset.shown?.endsWith(':0')")
+        page.keyboard.press("Space")
+        page.wait_for_timeout(500)
+        page.keyboard.press("Space")
+        assert int(page.get_attribute("#view", "data-shown").split(":")[1]) >= 5
+
+
+def test_other_specifications_have_labels_of_their_own(server, browser):
+    with opened(browser, server.address) as page:
+        shown(page)
+        page.keyboard.press("2")
+        page.wait_for_function("() => document.getElementById('specification').value === 'dropped'")
+        page.wait_for_timeout(300)
+        episode, before = shown(page), verdicts(server, "spilled")
+        press(page, "f")
+        saved(page)
+        assert verdicts(server, "dropped")[episode] is not None and verdicts(server, "spilled") == before
+
+
+def test_two_tabs_see_each_other_and_lose_nothing(server, browser):
+    context = browser.new_context()
+    with opened(browser, server.address, context) as one, opened(browser, server.address, context) as two:
+        for page in (one, two):
+            shown(page)
+            page.click("#episodes li[data-episode='10']")
+            page.wait_for_function("() => view.dataset.shown?.startsWith('10:')")
+        press(one, "f")
+        saved(one)
+        two.wait_for_function("() => view.dataset.episode === '10' && view.dataset.verdict !== 'open'")
+        # Both decide on the same state at once: the first counts, the second is told.
+        for page in (one, two):
+            page.click("#episodes li[data-episode='11']")
+            page.wait_for_function("() => view.dataset.shown?.startsWith('11:')")
+        two.route("**/api/labels/*?since=*", lambda route: route.abort())
+        press(one, "s")
+        saved(one)
+        press(two, "f")
+        two.wait_for_function("() => document.getElementById('toast').textContent.includes('changed by ann')")
+        length = len(verdicts(server, "spilled"))
+        assert verdicts(server, "spilled")[11] not in (None, 0) and length == 12
+
+
+def test_a_key_held_down_labels_one_episode(server, browser):
+    with opened(browser, server.address) as page:
+        page.keyboard.press("2")
+        page.wait_for_timeout(500)
+        press(page, "n")
+        shown(page)
+        before = verdicts(server, "dropped").count(None)
+        page.keyboard.down("s")
+        for _ in range(5):
+            page.keyboard.down("s")
+        page.keyboard.up("s")
+        saved(page)
+        assert verdicts(server, "dropped").count(None) == before - 1
+
+
+def test_labels_survive_a_kill_in_the_middle(filmed, browser, tmp_path):
+    root = shutil.copytree(filmed, tmp_path / "cup", ignore=shutil.ignore_patterns("labels"))
+    first = Server(root)
+    context = browser.new_context()
+    page = context.new_page()
+    page.goto(first.address)
+    page.wait_for_selector("#view[data-ready]")
+    press(page, "s", "s")
+    saved(page)
+    shown(page)
+    page.wait_for_timeout(300)  # the next episodes are there already
+    first.kill()
+    press(page, "s")
+    page.wait_for_selector("#banner:not([hidden])")
+    assert "1 label is kept in this browser" in page.inner_text("#banner")
+    second = Server(root, port=first.port)
+    try:
+        page.wait_for_function("() => banner.textContent.includes('open the address it printed')", timeout=10_000)
+        page.close(run_before_unload=False)
+        with opened(browser, second.address, context) as page:
+            saved(page)
+            time.sleep(0.2)
+            lengths = page.evaluate("async () => (await (await fetch('api/dataset')).json()).lengths")
+            assert verdicts(second, "spilled") == [*lengths[:3], *[None] * 9]
+    finally:
+        second.kill()

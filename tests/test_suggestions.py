@@ -1,0 +1,104 @@
+import shutil
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import tiny
+
+from lerobot_latentsafe.cli import main
+from lerobot_latentsafe.labeling import suggestions
+from lerobot_latentsafe.labeling.disagreements import find_disagreements
+from lerobot_latentsafe.labeling.frames import DatasetFrames
+from lerobot_latentsafe.labeling.store import LabelStore
+from lerobot_latentsafe.labeling.suggestions import Suggester, Suggestion, best_split, contradiction, episode_margins
+
+
+@pytest.fixture
+def root(dataset_root, tmp_path):
+    return shutil.copytree(dataset_root, tmp_path / "car")
+
+
+@pytest.mark.parametrize(
+    ("margin", "first"),
+    [([1, 1, -1, -1], 2), ([1, 1, 1], 3), ([-1, -1], 0), ([1, -0.1, 1, -1, -1, 0.1, -1], 3), ([0.0, 0.0], 2)],
+)
+def test_guess_is_the_split_that_fits_best(margin, first):
+    assert best_split(np.array(margin, float)) == first
+
+
+def test_certain_episodes_teach_little_uncertain_and_contradictory_ones_much():
+    certain = Suggestion.of(np.r_[np.ones(20), -np.ones(20)])
+    uncertain = Suggestion.of(np.r_[np.ones(20), 0.1 * np.ones(5), -np.ones(20)])
+    contradictory = Suggestion.of(np.r_[np.ones(20), -np.ones(20), np.ones(8)])
+    assert certain.usefulness == 0.0 < uncertain.usefulness < 0.5 < contradictory.usefulness
+
+
+def test_contradiction_counts_labelled_frames_only():
+    margin = np.r_[np.ones(10), -np.ones(10)]
+    failure = np.r_[np.zeros(10), np.ones(10)].astype(int)
+    assert contradiction(margin, failure) == 0.0
+    assert contradiction(margin, 1 - failure) == 1.0
+    assert contradiction(margin, np.full(20, -1)) == 0.0
+    failure[3:8] = -1
+    assert contradiction(-margin, np.where(failure < 0, -1, 1 - failure)) == 0.0
+
+
+def test_margins_are_those_of_filtering_frame_by_frame(policy, dataset_meta, cache_root, cache_meta):
+    import torch
+
+    from lerobot_latentsafe.datasets.clips import ClipReader
+
+    found = dict(episode_margins(policy, DatasetFrames(dataset_meta), batch_size=5))
+    assert sorted(found) == list(range(14))
+    reader, episode = ClipReader.of_dataset(policy.config, cache_meta), 3
+    index = np.flatnonzero(reader.labels.episode == episode)
+    images, state = reader.cache.frames(index)
+    action = policy.normalise_action(torch.from_numpy(reader.cache.action[index]))
+    latent, margin = None, []
+    with torch.no_grad():
+        for t in range(len(index)):
+            frame = {k: v[t : t + 1] for k, v in images.items()}
+            before = action[t - 1 : t] if t else None
+            latent = policy.world_model.observe(latent, before, frame, policy.normalise_state(state[t : t + 1]))
+            margin.append(policy.margin.bounded(policy.world_model.features(latent)).item())
+    np.testing.assert_allclose(found[episode], margin, atol=1e-4)
+
+
+def test_a_process_of_its_own_judges_all_episodes(root, tiny_filter):
+    new = []
+    suggester = Suggester(str(tiny_filter), tiny.REPO_ID, root, new.append)
+    end = time.time() + 60
+    while len(suggester.known) < 14 and time.time() < end:
+        time.sleep(0.2)
+    suggester.close()
+    assert sorted(suggester.known) == list(range(14)) and sorted(new) == list(range(1, 14))
+
+
+@pytest.mark.parametrize(
+    ("path", "why"),
+    [("no/such/filter", "no checkpoint"), ("dubins_diffusion_reckless", "expected a 'latentsafe' filter")],
+)
+def test_filter_that_cannot_judge_says_why(root, monkeypatch, path, why):
+    said = []
+    monkeypatch.setattr("os.nice", lambda by: None)
+    suggestions._judge(path, tiny.REPO_ID, str(root), SimpleNamespace(send=said.append))
+    assert len(said) == 1 and why in said[0]
+
+
+def test_disagreements_name_the_slip(root, tmp_path, capsys):
+    store = LabelStore(root, tiny.REPO_ID, ["spilled"])
+    margins = {e: np.r_[np.ones(n - 6), -np.ones(6)] for e, n in enumerate(store.length)}
+    for episode in range(5):
+        store.label("spilled", episode, int(store.length[episode]) - 6, "ann")
+    assert find_disagreements(store, "spilled", margins) == []
+    store.label("spilled", 3, int(store.length[3]), "bo")
+    assert [d.episode for d in find_disagreements(store, "spilled", margins)] == [3]
+    store.close()
+
+
+def test_check_labels_writes_a_page(root, tiny_filter, tmp_path, capsys):
+    page = tmp_path / "page.html"
+    main(["check-labels", f"--policy.path={tiny_filter}", f"--dataset.repo_id={tiny.REPO_ID}",
+          f"--dataset.root={root}", f"--output={page}"])  # fmt: skip
+    assert f"open {page}" in capsys.readouterr().out and "disagree with the filter" in page.read_text()
