@@ -92,7 +92,7 @@ class Demo:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("outputs/demo"))
-    parser.add_argument("--epsilon", type=float, default=0.1, help="the filter acts where V <= epsilon")
+    parser.add_argument("--epsilon", type=float, default=0.97, help="the filter acts where V <= epsilon")
     parser.add_argument("--n_episodes", type=int, default=60)
     arguments = parser.parse_args()
     out = arguments.out
@@ -111,12 +111,13 @@ def main() -> None:
     demo.run(
         "wrap",
         *("latentsafe", "wrap", f"--policy.path={critic}", f"--base_policy_path={found['base']}"),
-        *(f"--epsilon={arguments.epsilon}", f"--output_dir={out}/shielded"),
+        *(f"--epsilon={arguments.epsilon}", "--guard=6", f"--output_dir={out}/shielded"),
     )
+    save_every_seventh_state(out / "states.npy")
     demo.run(
         "monitor against the exact safe set",
         *("latentsafe", "eval-monitor", f"--policy.path={out}/shielded", "--env.type=latentsafe_dubins"),
-        *(f"--json={out}/monitor.json", f"--figure={out}/value_slices.png"),
+        *(f"--states={out}/states.npy", f"--json={out}/monitor.json", f"--figure={out}/value_slices.png"),
     )
     demo.run(
         f"bare against shielded: {arguments.n_episodes} starts each",
@@ -125,6 +126,15 @@ def main() -> None:
         *(f"--video={out}/videos", "--n_videos=3"),
     )
     report(out, time.time() - demo.started)
+
+
+def save_every_seventh_state(file: Path) -> None:
+    """A part of the paper's grid: enough for a demonstration's three digits."""
+    import numpy as np
+
+    from lerobot_latentsafe.evaluation.ground_truth import grid_states
+
+    np.save(file, grid_states()[::7])
 
 
 def report(out: Path, seconds: float) -> None:

@@ -34,11 +34,11 @@ filter() { # name source seed candidates [more options of lerobot-train]
     --output_dir="$OUT/filter_$name" --seeds="[$seed]"
 }
 
-diffusion() { # careful|reckless
+diffusion() { # careful|reckless [more options of lerobot-train]
   [ -e "$OUT/diffusion_$1/checkpoints/last" ] && return
   rm -rf "$OUT/diffusion_$1"
   $BIN/lerobot-train --config_path=configs/dubins_diffusion.yaml --dataset.repo_id="latentsafe/dubins_$1_cache" \
-    --dataset.root="$OUT/$1_cache" --output_dir="$OUT/diffusion_$1"
+    --dataset.root="$OUT/$1_cache" --output_dir="$OUT/diffusion_$1" "${@:2}"
 }
 
 three='[[-1.25,1.0],[0.0,1.0],[1.25,1.0]]'
@@ -54,16 +54,19 @@ data random_continuous 2000
 filter continuous random_continuous 0 null
 
 data reckless 100
-data careful 200
+data careful 300
 diffusion reckless
-diffusion careful
+diffusion careful --steps=3000
+law="--epsilon=0.97 --guard=6" # chosen on starts 5000 to 5049; the table's are 1000 to 1199
 for seed in 0 1 2; do
   for base in reckless careful; do
-    $BIN/latentsafe eval-shield --policy.path="$OUT/filter_$seed" --env.type=latentsafe_dubins --n_episodes=200 --seed=1000 \
+    $BIN/latentsafe eval-shield --policy.path="$OUT/filter_$seed" --env.type=latentsafe_dubins --n_episodes=200 --seed=1000 $law \
       --base_policy_path="$OUT/diffusion_$base/checkpoints/last/pretrained_model" \
       --json="results/dubins/shield_${base}_$seed.json" --figure="results/dubins/shield_${base}_$seed.png"
   done
 done
-$BIN/latentsafe eval-shield --policy.path="$OUT/filter_continuous" --env.type=latentsafe_dubins --n_episodes=200 --seed=1000 \
+$BIN/latentsafe eval-shield --policy.path="$OUT/filter_continuous" --env.type=latentsafe_dubins --n_episodes=200 --seed=1000 $law \
   --base_policy_path="$OUT/diffusion_reckless/checkpoints/last/pretrained_model" \
-  --json=results/dubins/shield_reckless_continuous.json
+  --json=results/dubins/shield_reckless_continuous.json --figure=results/dubins/shield_reckless_continuous.png
+$BIN/latentsafe eval-monitor --policy.path="$OUT/filter_continuous" --env.type=latentsafe_dubins --truth=continuous \
+  --json=results/dubins/monitor_continuous_actions.json
