@@ -251,5 +251,6 @@ def _make_renderer(model: mujoco.MjModel, size: int) -> mujoco.Renderer:
         raise RuntimeError(
             f"MuJoCo cannot make an OpenGL context with MUJOCO_GL={os.environ.get('MUJOCO_GL', '')!r} ({e}). "
             "Without a display use MUJOCO_GL=egl with libegl1 and libgl1-mesa-dri (Debian: apt-get install libegl1 "
-            "libgl1-mesa-dri), or MUJOCO_GL=osmesa with libosmesa6"
+            "libgl1-mesa-dri), or MUJOCO_GL=osmesa with libosmesa6; set it in the shell if another package imports "
+            "MuJoCo first"
         ) from e

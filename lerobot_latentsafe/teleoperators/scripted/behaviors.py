@@ -74,7 +74,12 @@ def lift(scene: bag.BagScene, segment: int, speed: float, rng: np.random.Generat
 def swing(scene: bag.BagScene, segment: int, speed: float, rng: np.random.Generator) -> Actions:
     """Grasp a segment, raise it a little and swing it from side to side, along the bag."""
     yield from grasp(scene, segment, rng)
-    start = scene.controller.position + up(0.05)
+    yield from swing_held(scene, speed, 0.05)
+
+
+def swing_held(scene: bag.BagScene, speed: float, height: float) -> Actions:
+    """Swing a grasped bag, raised by `height` metres."""
+    start = scene.controller.position + up(height)
     yield from reach(scene, start, 0.1, CLOSED)
     along = np.array([np.cos(scene.yaw), np.sin(scene.yaw), 0])
     while True:
@@ -101,6 +106,26 @@ def _lean(scene: FrankaScene) -> np.ndarray:
     """How far the hand leans from pointing down, about x and y (2,), rad."""
     axis = (scene.controller.rotation @ POINTING_DOWN.T)[:, 2]
     return np.array([-axis[1], axis[0]])
+
+
+def branch(scene: bag.BagScene, speed: float, rng: np.random.Generator) -> Actions:
+    """From a grasped bag, one of many things: what follows differs by the actions alone."""
+    start = scene.controller.position.copy()
+    kind = rng.choice(["lift", "lower", "pump", "swing", "wander", "hold"], p=[0.24, 0.24, 0.22, 0.1, 0.14, 0.06])
+    if kind == "lift":
+        yield from reach(scene, start + up(rng.uniform(0.08, 0.26)), speed, CLOSED)
+    elif kind == "lower":
+        yield from reach(scene, start + up(rng.uniform(0.02, 0.12)), speed, CLOSED)
+        yield from hold(CLOSED, int(rng.integers(8)))
+        yield from reach(scene, start, rng.uniform(0.1, MAX_SPEED), CLOSED)
+    elif kind == "pump":
+        while True:
+            yield from reach(scene, start + up(rng.uniform(0, 0.15)), rng.uniform(0.05, MAX_SPEED), CLOSED)
+            yield from hold(CLOSED, int(rng.integers(6)))
+    elif kind == "swing":
+        yield from swing_held(scene, speed, rng.uniform(0.02, 0.07))
+    elif kind == "wander":
+        yield from wander(scene, speed, rng)
 
 
 # The blocks
@@ -143,6 +168,7 @@ BAG: dict[str, tuple[Callable[..., Actions], tuple[float, float]]] = {
     "middle": (lambda scene, speed, rng: lift(scene, bag.MIDDLE, speed, rng), (0.10, 0.25)),
     "closed_end": (lambda scene, speed, rng: lift(scene, bag.TAIL, speed, rng), (0.15, 0.45)),
     "side_to_side": (lambda scene, speed, rng: swing(scene, bag.TAIL, speed, rng), (0.08, 0.45)),
+    "branch": (branch, (0.05, MAX_SPEED)),
     "random": (fumble, (0.2, MAX_SPEED)),
 }
 BLOCKS: dict[str, tuple[Callable[..., Actions], tuple[float, float]]] = {
