@@ -6,7 +6,9 @@ registries, and loads nothing heavy: models and simulators are imported when the
 
 from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
 from lerobot_latentsafe.envs.configuration_envs import LatentSafeBagEnv, LatentSafeBlocksEnv, LatentSafeDubinsEnv
+from lerobot_latentsafe.robots.franka.config_franka import LatentSafeFrankaConfig
 from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
+from lerobot_latentsafe.teleoperators.end_effector.config_end_effector import LatentSafeEndEffectorConfig
 from lerobot_latentsafe.teleoperators.scripted.config_scripted import LatentSafeScriptedConfig
 
 __all__ = [
@@ -14,6 +16,8 @@ __all__ = [
     "LatentSafeBlocksEnv",
     "LatentSafeConfig",
     "LatentSafeDubinsEnv",
+    "LatentSafeEndEffectorConfig",
+    "LatentSafeFrankaConfig",
     "LatentSafeFrankaMujocoConfig",
     "LatentSafeScriptedConfig",
 ]
