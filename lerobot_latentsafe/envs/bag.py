@@ -170,17 +170,17 @@ class BagScene(FrankaScene):
         opening = data.qpos[self.fingers].sum() / 2
         squeeze = max(0.0, HALF_OUTSIDE - opening)
         self.stop = 0.0
-        for k, segment in enumerate(self.segments):
+        for k in range(SEGMENTS):
             inwards = data.qpos[self.wall_qpos[k]]
             force = WALL_GAIN * (squeeze - inwards) if between[k] and squeeze > 0 else np.zeros(2)
             data.qfrc_applied[self.wall_dof[k]] = np.clip(force, 0, WALL_FORCE)
             if between[k]:
                 self.stop = max(self.stop, HALF_OUTSIDE - inwards.min() - 0.004)
-            held = bool(data.eq_active[segment.weld])
-            if held and travel > 0.032:
-                data.eq_active[segment.weld] = 0
-            elif not held and between[k] and abs(local[k, 0]) < 0.016 and squeeze > 0.010 and travel < 0.03:
-                self._weld(segment, rotation)
+        held, nearest = self.held_segment(), int(np.abs(local[:, 0]).argmin())
+        if held is not None and travel > 0.032:
+            data.eq_active[self.segments[held].weld] = 0
+        elif held is None and between[nearest] and squeeze > 0.010 and travel < 0.03:
+            self._weld(self.segments[nearest], rotation)
 
     def _weld(self, segment: Segment, rotation: np.ndarray) -> None:
         """Join a segment to the hand in their present relative pose."""
