@@ -42,16 +42,20 @@ def episode(scene: FrankaScene, behavior: str, seed: int, speed: float | None = 
 
 
 def spills(n: int) -> dict:
-    scene, row = BagScene(), {}
-    for name, behavior, speed in (
-        ("closed_end", "closed_end", None), ("middle", "middle", None), ("open_end", "open_end", None),
-        ("side_to_side_0.08", "side_to_side", 0.08), ("side_to_side_0.15", "side_to_side", 0.15),
-        ("side_to_side_0.25", "side_to_side", 0.25), ("side_to_side_0.45", "side_to_side", 0.45),
-    ):  # fmt: skip
-        counts = [max(t["spilled"] for t in episode(scene, behavior, FIRST_SEED + i, speed)) for i in range(n)]
-        row[name] = {"any_candy": wilson(sum(c > 0 for c in counts), n), "mean_candies": float(np.mean(counts))}
-        print(name, row[name], flush=True)
-    return {"candies": scene.n_candies, **row}
+    return {name: share_spilling(name, None, n) for name in ("closed_end", "middle", "open_end")}
+
+
+def swings(n: int) -> dict:
+    return {f"{speed} m/s": share_spilling("side_to_side", speed, n) for speed in (0.08, 0.15, 0.25, 0.45)}
+
+
+def share_spilling(behavior: str, speed: float | None, n: int) -> dict:
+    """Episodes in which any candy was spilled, and how many candies on average."""
+    scene = BagScene()
+    counts = [max(t["spilled"] for t in episode(scene, behavior, FIRST_SEED + i, speed)) for i in range(n)]
+    row = {"any_candy": wilson(sum(c > 0 for c in counts), n), "mean_candies": float(np.mean(counts))}
+    print(behavior, speed, row, flush=True)
+    return row
 
 
 def variants(n: int) -> dict:
@@ -213,8 +217,8 @@ def seconds_a_frame(draw, n: int) -> float:
 
 
 PARTS = {
-    "spills": (spills, 100), "variants": (variants, 50), "explosions": (explosions, 1000), "doomed": (doomed, 20),
-    "leak": (leak, 400), "plucks": (plucks, 100), "render": (render, 400),
+    "spills": (spills, 100), "swings": (swings, 50), "variants": (variants, 50), "explosions": (explosions, 1000),
+    "doomed": (doomed, 20), "leak": (leak, 400), "plucks": (plucks, 100), "render": (render, 400),
 }  # fmt: skip
 
 
