@@ -89,7 +89,7 @@ def _scene() -> str:
         for name, colour in zip(NAMES, ("0.1 0.7 0.15", "0.85 0.08 0.08", "0.85 0.08 0.08"))
     )
     return f"""
-<option timestep="{TIMESTEP}" integrator="implicitfast" cone="elliptic" impratio="3" iterations="20" ls_iterations="15"
+<option timestep="{TIMESTEP}" integrator="implicitfast" cone="elliptic" impratio="3" iterations="50" ls_iterations="50"
   tolerance="1e-7"/>
 <default>
   <default class="block">

@@ -28,6 +28,8 @@ from lerobot_latentsafe.robots.franka_interface import (
 ASSETS = Path(__file__).parent / "assets"
 CAMERAS = ("front", "wrist")
 TIMESTEP = 1 / 600
+REACH_TOLERANCE = 0.005
+"""Distance of the inverse kinematics' solution beyond which a pose counts as out of reach, m."""
 PHYSICS = mujoco.mjtState.mjSTATE_INTEGRATION
 
 VISUAL = """<visual>
@@ -140,13 +142,21 @@ class FrankaScene:
         raise NotImplementedError
 
     def step(self, action: np.ndarray) -> None:
-        """Advance one control step. action: (7,), see `robots/franka_interface.py`; clipped into its limits."""
+        """Advance one control step. action: (7,), see `robots/franka_interface.py`; clipped into its limits.
+
+        A motion to a pose the arm cannot reach is not begun: the arm stays, only the fingers move.
+        """
         action = np.clip(action, *action_limits(self.fps))
         control = self.controller
-        control.position = np.clip(control.position + action[:3], WORKSPACE_LOW, WORKSPACE_HIGH)
-        control.rotation = mink.SO3.exp(action[3:6]).as_matrix() @ control.rotation
-        wanted = self.kinematics.solve(control.joints, control.position, control.rotation)
-        self._drive(wanted, action[6])
+        position = np.clip(control.position + action[:3], WORKSPACE_LOW, WORKSPACE_HIGH)
+        rotation = mink.SO3.exp(action[3:6]).as_matrix() @ control.rotation
+        joints = self.kinematics.solve(control.joints, position, rotation)
+        reached, _ = self.kinematics.pose(joints)
+        if np.linalg.norm(reached - position) < REACH_TOLERANCE:
+            control.position, control.rotation = position, rotation
+        else:
+            joints = control.joints
+        self._drive(joints, action[6])
 
     def move_joints(self, joints: np.ndarray, gripper: float) -> None:
         """Advance one control step towards joint angles (7,); the commanded pose follows."""

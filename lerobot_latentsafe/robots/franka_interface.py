@@ -33,7 +33,7 @@ GRIPPER_WIDTH = 0.08
 GRIPPER_SPEED = 0.1
 """Speed of the opening, m/s."""
 POINTING_DOWN = np.diag([1.0, -1.0, -1.0])
-WORKSPACE_LOW, WORKSPACE_HIGH = np.array([0.28, -0.36, 0.024]), np.array([0.72, 0.36, 0.52])
+WORKSPACE_LOW, WORKSPACE_HIGH = np.array([0.28, -0.36, 0.024]), np.array([0.72, 0.36, 0.45])
 """Box the commanded tool centre stays in, metres."""
 MAX_SPEED, MAX_TURN_SPEED = 0.45, 2.0
 """Limits of the commanded motion, m/s along each axis and rad/s about each."""

@@ -34,7 +34,7 @@ class LatentSafeFrankaConfig(RobotConfig):
     monitor: bool = False
     tool_offset: float = 0.0616
     workspace_low: tuple[float, float, float] = (0.28, -0.36, 0.024)
-    workspace_high: tuple[float, float, float] = (0.72, 0.36, 0.52)
+    workspace_high: tuple[float, float, float] = (0.72, 0.36, 0.45)
     max_lead: float = 0.04
     max_lead_turn: float = 0.25
     stiffness: float = 600.0
