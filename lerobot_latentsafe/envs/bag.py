@@ -206,10 +206,14 @@ class BagScene(FrankaScene):
         """Which candies are outside the pouch, bool (N,): in no segment's inside, with a margin."""
         data, inside = self.data, np.zeros(self.n_candies, bool)
         at = data.xpos[self.candies]
-        reach = np.array([LENGTH / 2, WIDTH / 2, HEIGHT / 2]) + SPILL_MARGIN
+        # Along the bag, neighbours overlap: a folded bag opens wedges between them. Nothing lies beyond the mouth.
+        reach = np.array([0.75 * LENGTH, WIDTH / 2 + SPILL_MARGIN, HEIGHT / 2 + SPILL_MARGIN])
         for body in self.bodies:
             local = (at - data.xpos[body]) @ data.xmat[body].reshape(3, 3)
-            inside |= (np.abs(local) < reach).all(1)
+            within = (np.abs(local) < reach).all(1)
+            if body == self.bodies[MOUTH]:
+                within &= local[:, 0] < LENGTH / 2 + SPILL_MARGIN
+            inside |= within
         return ~inside
 
     def segment_position(self, k: int) -> np.ndarray:

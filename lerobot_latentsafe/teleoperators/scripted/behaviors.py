@@ -74,7 +74,7 @@ def lift(scene: bag.BagScene, segment: int, speed: float, rng: np.random.Generat
 def swing(scene: bag.BagScene, segment: int, speed: float, rng: np.random.Generator) -> Actions:
     """Grasp a segment, raise it a little and swing it from side to side, along the bag."""
     yield from grasp(scene, segment, rng)
-    yield from swing_held(scene, speed, 0.05)
+    yield from swing_held(scene, speed, 0.08)
 
 
 def swing_held(scene: bag.BagScene, speed: float, height: float) -> Actions:
@@ -84,7 +84,7 @@ def swing_held(scene: bag.BagScene, speed: float, height: float) -> Actions:
     along = np.array([np.cos(scene.yaw), np.sin(scene.yaw), 0])
     while True:
         for sign in (1, -1):
-            yield from reach(scene, start + sign * 0.06 * along, speed, CLOSED)
+            yield from reach(scene, start + sign * 0.08 * along, speed, CLOSED)
 
 
 def wander(scene: FrankaScene, speed: float, rng: np.random.Generator) -> Actions:
