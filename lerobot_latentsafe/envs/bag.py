@@ -294,7 +294,7 @@ def _scene(variant: Variant, n_candies: int) -> str:
 <worldbody>
   <geom name="table" type="box" size="0.6 0.6 0.02" pos="0.45 0 -0.02" material="{table}" friction="0.6 0.005 0.0001"
     contype="1" conaffinity="15" solref="0.008 1"/>
-  <camera name="front" pos="1.16 0.45 0.44" xyaxes="-0.56 0.83 0 -0.30 -0.20 0.93" fovy="48"/>
+  <camera name="front" pos="1.16 0.45 0.44" xyaxes="-0.563 0.826 0 -0.307 -0.210 0.928" fovy="36"/>
   {_segment(0, variant)}
   {"".join(_candy(i) for i in range(n_candies))}
 </worldbody>
@@ -320,6 +320,11 @@ def _segment(k: int, variant: Variant) -> str:
         f'<geom class="film" size="{floor}" pos="0 0 {-HEIGHT / 2 - FILM}" mass="0.003"/>',
         f'<geom class="film" size="{roof}" pos="0 0 {HEIGHT / 2 + THICK}" mass="0.003"/>',
     ]
+    if k == 0:  # what the eye knows the closed end by: a crimped, silvery edge
+        parts.append(
+            f'<geom class="visual" type="box" size="0.005 {HALF_OUTSIDE} 0.0035" pos="{0.006 - LENGTH / 2} 0 0" '
+            'rgba="0.88 0.88 0.9 1"/>'
+        )
     if k == 1:  # the seal between tail and pouch
         parts.append(
             f'<geom class="film" size="{THICK} {WIDTH / 2} {HEIGHT / 2}" pos="{-LENGTH / 2 - THICK} 0 0" '
