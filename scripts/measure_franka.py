@@ -216,9 +216,37 @@ def seconds_a_frame(draw, n: int) -> float:
     return (time.perf_counter() - began) / n
 
 
+def recording(n: int) -> dict:
+    """All threads' CPU time, after one recording to warm up; label balance of what was recorded."""
+    import tempfile
+
+    from lerobot_latentsafe.datasets.collect_franka import collect_franka
+    from lerobot_latentsafe.datasets.labels import FailureLabels
+
+    row = {}
+    for source in ("bag_mix", "blocks_demos"):
+        with tempfile.TemporaryDirectory() as folder:
+            collect_franka(source, "me/warm", f"{folder}/warm", 1, 1)
+            began = time.process_time()
+            dataset = collect_franka(source, "me/timed", f"{folder}/timed", n, 0)
+            seconds = (time.process_time() - began) / n
+            labels = FailureLabels.load(dataset.root)
+            failing = np.unique(labels.episode[labels.failure == 1])
+            row[source] = {
+                "cpu_seconds_an_episode": seconds,
+                "episodes": n,
+                "frames": dataset.num_frames,
+                "failing_episodes": len(failing),
+                "failing_frames": int((labels.failure == 1).sum()),
+            }
+        print(source, row[source], flush=True)
+    return row
+
+
 PARTS = {
     "spills": (spills, 100), "swings": (swings, 50), "variants": (variants, 50), "explosions": (explosions, 1000),
     "doomed": (doomed, 20), "leak": (leak, 400), "plucks": (plucks, 100), "render": (render, 400),
+    "recording": (recording, 20),
 }  # fmt: skip
 
 
