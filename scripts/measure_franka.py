@@ -23,6 +23,7 @@ from lerobot_latentsafe.envs.bag import BagScene
 from lerobot_latentsafe.envs.blocks import BlocksScene
 from lerobot_latentsafe.envs.franka import FrankaScene
 from lerobot_latentsafe.evaluation.rollouts import provenance, wilson, write_json
+from lerobot_latentsafe.robots.franka_interface import MAX_SPEED
 from lerobot_latentsafe.teleoperators.scripted.behaviors import begin, grasp
 
 OUT = Path("results/franka")
@@ -46,7 +47,7 @@ def spills(n: int) -> dict:
 
 
 def swings(n: int) -> dict:
-    return {f"{speed} m/s": share_spilling("side_to_side", speed, n) for speed in (0.08, 0.15, 0.25, 0.45)}
+    return {f"{speed} m/s": share_spilling("side_to_side", speed, n) for speed in (0.08, 0.15, 0.25, 0.30)}
 
 
 def share_spilling(behavior: str, speed: float | None, n: int) -> dict:
@@ -90,12 +91,13 @@ def explosions(n: int) -> dict:
 
 def retreats(rng: np.random.Generator, n_random: int = 6) -> Iterator[np.ndarray]:
     """Constant velocities (3,) in m per step to try from a state: hold, lower, lower sideways, random."""
+    fastest = MAX_SPEED / 15
     yield np.zeros(3)
-    for down in (-0.01, -0.02, -0.03):
-        yield np.array([0, 0, down])
+    for share in (0.33, 0.67, 1.0):
+        yield np.array([0, 0, -share * fastest])
     for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-        yield np.array([0.02 * x, 0.02 * y, -0.03])
-    yield from rng.uniform([-0.03, -0.03, -0.03], [0.03, 0.03, 0.01], (n_random, 3))
+        yield fastest * np.array([0.67 * x, 0.67 * y, -1])
+    yield from fastest * rng.uniform([-1, -1, -1], [1, 1, 0.33], (n_random, 3))
 
 
 def recoverable(scene: BagScene, state, rng: np.random.Generator) -> bool:

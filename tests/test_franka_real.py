@@ -123,8 +123,8 @@ def test_the_commanded_pose_stays_in_the_workspace_and_near_the_arm(robot):
     assert (rotation * DOWN.inv()).magnitude() == pytest.approx(robot.config.max_lead_turn)
     robot.driver.position = np.array([0.45, 0.0, 0.03])
     sent = robot.send_action(STILL | {"delta_z.pos": -0.03})
-    robot.send_action(STILL | {"delta_z.pos": -0.03})
-    robot.send_action(STILL | {"delta_z.pos": -0.03})
+    for _ in range(3):
+        robot.send_action(STILL | {"delta_z.pos": -0.03})
     assert robot._stream.target()[0][2] == pytest.approx(robot.config.workspace_low[2])
     assert sent["delta_z.pos"] == pytest.approx(0.03 + 0.04 - 0.30)  # what was commanded, not what was asked
 
@@ -134,7 +134,7 @@ def test_without_new_actions_the_arm_holds(robot, caplog):
     with caplog.at_level(logging.WARNING):
         robot.send_action(STILL | {"delta_y.pos": 0.03})
         wait_for(lambda: "holding" in caplog.text)
-    assert robot._stream.target()[0][1] < 0.03
+    assert robot._stream.target()[0][1] < 0.02
 
 
 def test_the_gripper_moves_when_the_wish_changes(robot):

@@ -45,14 +45,14 @@ def test_features_end_as_lerobot_keeps_them_and_match(robot):
 def test_what_is_returned_is_what_was_executed(robot, caplog):
     with caplog.at_level(logging.WARNING):
         sent = robot.send_action(STILL | {"delta_x.pos": 1.0})
-    assert sent["delta_x.pos"] == pytest.approx(0.45 / 20) and "clipped" in caplog.text
+    assert sent["delta_x.pos"] == pytest.approx(0.30 / 20) and "clipped" in caplog.text
     assert robot.send_action(sent) == sent
 
 
 def test_lerobots_return_to_the_start_is_a_joint_move(robot):
     start = robot.get_observation()
     for _ in range(10):
-        robot.send_action(STILL | {"delta_x.pos": 0.02, "delta_y.pos": 0.02})
+        robot.send_action(STILL | {"delta_x.pos": 0.015, "delta_y.pos": 0.015})
     back = {name: value for name, value in start.items() if name.endswith(".pos")}
     for _ in range(40):
         sent = robot.send_action(back)

@@ -35,7 +35,7 @@ GRIPPER_SPEED = 0.1
 POINTING_DOWN = np.diag([1.0, -1.0, -1.0])
 WORKSPACE_LOW, WORKSPACE_HIGH = np.array([0.28, -0.36, 0.024]), np.array([0.72, 0.36, 0.45])
 """Box the commanded tool centre stays in, metres."""
-MAX_SPEED, MAX_TURN_SPEED = 0.45, 2.0
+MAX_SPEED, MAX_TURN_SPEED = 0.30, 2.0
 """Limits of the commanded motion, m/s along each axis and rad/s about each."""
 
 

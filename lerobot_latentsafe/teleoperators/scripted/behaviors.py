@@ -74,7 +74,7 @@ def lift(scene: bag.BagScene, segment: int, speed: float, rng: np.random.Generat
 def swing(scene: bag.BagScene, segment: int, speed: float, rng: np.random.Generator) -> Actions:
     """Grasp a segment, raise it a little and swing it from side to side, along the bag."""
     yield from grasp(scene, segment, rng)
-    yield from swing_held(scene, speed, 0.08)
+    yield from swing_held(scene, speed, 0.10)
 
 
 def swing_held(scene: bag.BagScene, speed: float, height: float) -> Actions:
@@ -164,17 +164,17 @@ def fumble(scene: bag.BagScene, speed: float, rng: np.random.Generator) -> Actio
 # Behaviours by name
 
 BAG: dict[str, tuple[Callable[..., Actions], tuple[float, float]]] = {
-    "open_end": (lambda scene, speed, rng: lift(scene, bag.MOUTH, speed, rng), (0.10, 0.45)),
+    "open_end": (lambda scene, speed, rng: lift(scene, bag.MOUTH, speed, rng), (0.10, MAX_SPEED)),
     "middle": (lambda scene, speed, rng: lift(scene, bag.MIDDLE, speed, rng), (0.10, 0.25)),
-    "closed_end": (lambda scene, speed, rng: lift(scene, bag.TAIL, speed, rng), (0.15, 0.45)),
-    "side_to_side": (lambda scene, speed, rng: swing(scene, bag.TAIL, speed, rng), (0.08, 0.45)),
+    "closed_end": (lambda scene, speed, rng: lift(scene, bag.TAIL, speed, rng), (0.15, MAX_SPEED)),
+    "side_to_side": (lambda scene, speed, rng: swing(scene, bag.TAIL, speed, rng), (0.08, MAX_SPEED)),
     "branch": (branch, (0.05, MAX_SPEED)),
     "random": (fumble, (0.2, MAX_SPEED)),
 }
 BLOCKS: dict[str, tuple[Callable[..., Actions], tuple[float, float]]] = {
     "random": (play, (0.2, MAX_SPEED)),
     "pluck_careful": (lambda scene, speed, rng: pluck(scene, 0.001, 0.0, speed, rng), (0.15, 0.25)),
-    "pluck_careless": (lambda scene, speed, rng: pluck(scene, 0.004, 0.08, speed, rng), (0.25, 0.35)),
+    "pluck_careless": (lambda scene, speed, rng: pluck(scene, 0.004, 0.08, speed, rng), (0.20, MAX_SPEED)),
 }
 """Name -> the behaviour and the range of its speed, m/s."""
 
