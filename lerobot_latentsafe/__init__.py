@@ -1,11 +1,24 @@
 """Latent safety filters for LeRobot.
 
-Importing this package registers the policy, environments and world-model configurations with LeRobot's
+Importing this package registers the policy, environments, robots, teleoperators and world models with LeRobot's
 registries, and loads nothing heavy: models and simulators are imported when they are used.
 """
 
 from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
-from lerobot_latentsafe.envs.configuration_envs import LatentSafeDubinsEnv
+from lerobot_latentsafe.envs.configuration_envs import LatentSafeBagEnv, LatentSafeBlocksEnv, LatentSafeDubinsEnv
+from lerobot_latentsafe.robots.franka.config_franka import LatentSafeFrankaConfig
+from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
+from lerobot_latentsafe.teleoperators.end_effector.config_end_effector import LatentSafeEndEffectorConfig
+from lerobot_latentsafe.teleoperators.scripted.config_scripted import LatentSafeScriptedConfig
 
-__all__ = ["LatentSafeConfig", "LatentSafeDubinsEnv"]
+__all__ = [
+    "LatentSafeBagEnv",
+    "LatentSafeBlocksEnv",
+    "LatentSafeConfig",
+    "LatentSafeDubinsEnv",
+    "LatentSafeEndEffectorConfig",
+    "LatentSafeFrankaConfig",
+    "LatentSafeFrankaMujocoConfig",
+    "LatentSafeScriptedConfig",
+]
 __version__ = "0.1.0"

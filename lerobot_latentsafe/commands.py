@@ -48,22 +48,32 @@ class OptionalPolicySource:
 
 @dataclass
 class Collect:
-    """Record labelled episodes of the Dubins car.
+    """Record labelled episodes of a simulated task.
 
-    Sources: random (the paper's 2,000 trajectories of three actions), random_continuous, random_left_only (the
-    ablation), careful and reckless (goal-reaching demonstrations for diffusion policies).
+    Sources of the Dubins car: random (the paper's 2,000 trajectories of three actions), random_continuous,
+    random_left_only (the ablation), careful and reckless (goal-reaching demonstrations for diffusion policies).
+    Sources of the Franka: bag_mix (the paper's 1,300 trajectories), bag_branches (several from each grasped state),
+    bag_strong, bag_weak, blocks_demos, blocks_random. A killed recording of the Franka goes on if started again.
     """
 
     source: str
     repo_id: str
     root: Path
-    n_episodes: int = 2000
+    n_episodes: int | None = None
+    """None: 2,000 of the car, and as many of the Franka as the source says."""
     seed: int = 0
 
     def run(self) -> None:
-        from lerobot_latentsafe.datasets.collect import collect_dubins
+        from lerobot_latentsafe.datasets import collect, collect_franka
 
-        dataset = collect_dubins(self.source, self.repo_id, self.root, self.n_episodes, self.seed)
+        if self.source in collect_franka.SOURCES:
+            record = collect_franka.collect_franka
+        elif self.source in collect.SOURCES:
+            record = collect.collect_dubins
+        else:
+            known = ", ".join([*collect.SOURCES, *collect_franka.SOURCES])
+            raise ValueError(f"--source is {self.source!r}; expected one of {known}")
+        dataset = record(self.source, self.repo_id, self.root, self.n_episodes, self.seed)
         print(f"{dataset.num_episodes} episodes, {dataset.num_frames} frames in {self.root}")
 
 

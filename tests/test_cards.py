@@ -5,40 +5,49 @@ from pathlib import Path
 import pytest
 import yaml
 
+from lerobot_latentsafe.datasets import collect_franka
 from lerobot_latentsafe.datasets.collect import FEATURES, POSITION, SOURCES, WITH_POSITION
+from lerobot_latentsafe.envs.scenes import SCENES
 
 FOLDER = Path(__file__).parents[1] / "datasets_cards"
 
 
-def features(source):
-    return {**FEATURES, **(POSITION if source in WITH_POSITION else {})}
+CARDS = {f"dubins_{source}": source for source in SOURCES} | {source: source for source in collect_franka.SOURCES}
+"""Name of a card -> what `latentsafe collect` calls the source."""
 
 
-@pytest.mark.parametrize("source", SOURCES)
-def test_card_matches_the_dataset(source):
-    text = (FOLDER / f"dubins_{source}.md").read_text()
+def recorded(source):
+    """fps, robot type and features of a source's dataset."""
+    if source in SOURCES:
+        return 20, "latentsafe_dubins", {**FEATURES, **(POSITION if source in WITH_POSITION else {})}
+    franka = collect_franka.SOURCES[source]
+    return SCENES[franka.scene].fps, "latentsafe_franka_mujoco", collect_franka.features(franka)
+
+
+@pytest.mark.parametrize("card", CARDS)
+def test_card_matches_the_dataset(card):
+    text = (FOLDER / f"{card}.md").read_text()
     blocks = re.findall(r"```json\n(.*?)```", text, re.DOTALL)
     assert len(blocks) == 1
+    fps, robot_type, features = recorded(CARDS[card])
     assert json.loads(blocks[0]) == {
-        "fps": 20,
-        "robot_type": "latentsafe_dubins",
-        "features": {
-            name: {"dtype": f["dtype"], "shape": list(f["shape"])} for name, f in features(source).items()
-        },
-    }  # fmt: skip
+        "fps": fps,
+        "robot_type": robot_type,
+        "features": {name: {"dtype": f["dtype"], "shape": list(f["shape"])} for name, f in features.items()},
+    }
 
 
-@pytest.mark.parametrize("source", SOURCES)
-def test_card_has_a_header_and_the_command_that_makes_it(source):
-    text = (FOLDER / f"dubins_{source}.md").read_text()
+@pytest.mark.parametrize("card", CARDS)
+def test_card_has_a_header_and_the_command_that_makes_it(card):
+    text = (FOLDER / f"{card}.md").read_text()
     header = yaml.safe_load(re.match(r"---\n(.*?)\n---\n", text, re.DOTALL)[1])
     assert header["license"] == "apache-2.0" and "LeRobot" in header["tags"]
-    assert f"latentsafe collect --source={source} " in text
-    assert all(f"`{name}`" in text for name in features(source))
+    assert f"latentsafe collect --source={CARDS[card]} " in text
+    assert all(f"`{name}`" in text for name in recorded(CARDS[card])[2])
 
 
 def test_no_card_is_left_over():
-    assert {card.stem for card in FOLDER.glob("*.md")} == {f"dubins_{source}" for source in SOURCES}
+    assert {card.stem for card in FOLDER.glob("*.md")} == set(CARDS)
 
 
 def test_recorded_dataset_is_what_the_card_says(dataset_root):

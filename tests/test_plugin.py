@@ -21,6 +21,8 @@ loaded = sorted(sys.modules)
 import gymnasium
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
+from lerobot.robots.config import RobotConfig
+from lerobot.teleoperators.config import TeleoperatorConfig
 import lerobot_latentsafe, lerobot_policy_latentsafe
 from lerobot_latentsafe.world_models.base import WorldModelConfig
 print(json.dumps({
@@ -28,6 +30,8 @@ print(json.dumps({
     "files": [lerobot_latentsafe.__file__, lerobot_policy_latentsafe.__file__],
     "policies": list(PreTrainedConfig.get_known_choices()),
     "envs": list(EnvConfig.get_known_choices()),
+    "robots": list(RobotConfig.get_known_choices()),
+    "teleoperators": list(TeleoperatorConfig.get_known_choices()),
     "world_models": list(WorldModelConfig.get_known_choices()),
     "gym": [name for name in gymnasium.registry if name.startswith("lerobot_latentsafe/")],
 }))
@@ -73,7 +77,8 @@ def test_wheel_is_named_as_lerobot_looks_for_it(wheel):
 
 def test_wheel_holds_every_module_and_checkpoint(installed):
     package = REPOSITORY / "lerobot_latentsafe"
-    wanted = [*package.rglob("*.py"), *(f for f in (package / "pretrained").rglob("*") if f.is_file())]
+    data = [f for folder in ("pretrained", "envs/assets") for f in (package / folder).rglob("*") if f.is_file()]
+    wanted = [*package.rglob("*.py"), *data]
     missing = [f.relative_to(REPOSITORY) for f in wanted if not (installed / f.relative_to(REPOSITORY)).exists()]
     assert [f for f in missing if f.parts[1] != "_plugin"] == []
     assert (installed / "lerobot_policy_latentsafe" / "__init__.py").exists()
@@ -96,15 +101,18 @@ def test_wheel_holds_nothing_else(installed):
 def test_lerobot_discovers_policy_env_and_world_model(discovered, installed):
     assert all(Path(file).is_relative_to(installed) for file in discovered["files"])  # not this repository's
     assert "latentsafe" in discovered["policies"]
-    assert "latentsafe_dubins" in discovered["envs"]
+    assert {"latentsafe_dubins", "latentsafe_bag", "latentsafe_blocks"} <= set(discovered["envs"])
+    assert {"latentsafe_franka", "latentsafe_franka_mujoco"} <= set(discovered["robots"])
+    assert {"latentsafe_scripted", "latentsafe_end_effector"} <= set(discovered["teleoperators"])
     assert "rssm" in discovered["world_models"]
-    assert discovered["gym"] == ["lerobot_latentsafe/Dubins-v0"]
+    assert discovered["gym"] == [f"lerobot_latentsafe/{name}-v0" for name in ("Dubins", "Bag", "Blocks")]
 
 
 def test_importing_the_package_loads_nothing_heavy(discovered):
     assert "lerobot_latentsafe" in discovered["loaded"]
     heavy = {
-        "mujoco", "matplotlib", "scipy", "jax", "hj_reachability", "transformers", "datasets", "pandas",
+        "mujoco", "mink", "franky", "matplotlib", "scipy", "jax", "hj_reachability", "transformers", "datasets",
+        "pandas",
         "lerobot_latentsafe.modeling_latentsafe", "lerobot_latentsafe.envs.dubins", "lerobot_latentsafe.commands",
     }  # fmt: skip
     assert heavy.isdisjoint(discovered["loaded"])

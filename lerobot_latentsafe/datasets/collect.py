@@ -137,8 +137,8 @@ SOURCES: dict[str, Callable[[int, np.random.Generator], Iterator[Episode]]] = {
 WITH_POSITION = ("careful", "reckless")
 
 
-def collect_dubins(source: str, repo_id: str, root: str | Path, n_episodes: int, seed: int) -> "LeRobotDataset":
-    """Record episodes of the car as a LeRobotDataset.
+def collect_dubins(source: str, repo_id: str, root: str | Path, n_episodes: int | None, seed: int) -> "LeRobotDataset":
+    """Record episodes of the car as a LeRobotDataset; None records the paper's 2,000.
 
     Demonstrations also store the car's position as observation.environment_state, which lets a diffusion policy
     of a few hundred kB do the task; the safety filter reads images and heading only.
@@ -154,6 +154,7 @@ def collect_dubins(source: str, repo_id: str, root: str | Path, n_episodes: int,
         raise ValueError(f"--source is {source!r}; expected one of {', '.join(SOURCES)}")
     if Path(root).exists():
         raise FileExistsError(f"{root} exists; choose another --root or delete it")
+    n_episodes = n_episodes or 2000
     features = {**FEATURES, **(POSITION if source in WITH_POSITION else {})}
     dataset = LeRobotDataset.create(
         repo_id, dubins.FPS, features, root=root, robot_type="latentsafe_dubins", use_videos=False,

@@ -5,7 +5,10 @@ from dataclasses import dataclass, field
 import gymnasium as gym
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
-from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGE, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGE, OBS_IMAGES, OBS_STATE
+
+from lerobot_latentsafe.envs.scenes import SCENES, check_scene
+from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, STATE_NAMES
 
 
 @EnvConfig.register_subclass("latentsafe_dubins")
@@ -57,9 +60,84 @@ class LatentSafeDubinsEnv(EnvConfig):
         }
 
 
+@dataclass
+class FrankaEnv(EnvConfig):
+    """A scene of the simulated Franka, with the features its robot records.
+
+    Attributes:
+        variant: of the scene, see `envs/scenes.py`; None takes the default.
+        episode_length: control steps; None takes the scene's.
+        image_size: side of both cameras' images; None takes the scene's.
+    """
+
+    variant: str | None = None
+    episode_length: int | None = None
+    image_size: int | None = None
+    features: dict[str, PolicyFeature] = field(
+        default_factory=lambda: {
+            ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(len(ACTION_NAMES),)),
+            "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(len(STATE_NAMES),)),
+        }
+    )
+    features_map: dict[str, str] = field(
+        default_factory=lambda: {
+            ACTION: ACTION,
+            "agent_pos": OBS_STATE,
+            "pixels/front": f"{OBS_IMAGES}.front",
+            "pixels/wrist": f"{OBS_IMAGES}.wrist",
+        }
+    )
+
+    def __post_init__(self) -> None:
+        info = check_scene(self.scene, self.variant, self.image_size)
+        self.variant = self.variant or info.variants[0]
+        self.image_size = self.image_size or info.image_size
+        self.episode_length = self.episode_length or round(info.episode_seconds * info.fps)
+        for camera in ("front", "wrist"):
+            shape = (self.image_size, self.image_size, 3)
+            self.features[f"pixels/{camera}"] = PolicyFeature(type=FeatureType.VISUAL, shape=shape)
+
+    @property
+    def scene(self) -> str:
+        """Name of the scene, from the type: latentsafe_<scene>."""
+        return self.type.removeprefix("latentsafe_")
+
+    @property
+    def package_name(self) -> str:
+        return "lerobot_latentsafe"
+
+    @property
+    def gym_kwargs(self) -> dict:
+        return {
+            "variant": self.variant,
+            "episode_length": self.episode_length,
+            "image_size": self.image_size,
+        }
+
+
+@EnvConfig.register_subclass("latentsafe_bag")
+@dataclass
+class LatentSafeBagEnv(FrankaEnv):
+    """Lift an open bag without spilling candy (see `envs/bag.py`)."""
+
+    task: str | None = "Bag-v0"
+    fps: int = SCENES["bag"].fps
+
+
+@EnvConfig.register_subclass("latentsafe_blocks")
+@dataclass
+class LatentSafeBlocksEnv(FrankaEnv):
+    """Pluck a block from between two others (see `envs/blocks.py`)."""
+
+    task: str | None = "Blocks-v0"
+    fps: int = SCENES["blocks"].fps
+
+
 def _register(gym_id: str, entry_point: str) -> None:
     if gym_id not in gym.registry:
         gym.register(gym_id, entry_point=entry_point, disable_env_checker=True)
 
 
 _register("lerobot_latentsafe/Dubins-v0", "lerobot_latentsafe.envs.dubins:DubinsEnv")
+_register("lerobot_latentsafe/Bag-v0", "lerobot_latentsafe.envs.franka_env:BagEnv")
+_register("lerobot_latentsafe/Blocks-v0", "lerobot_latentsafe.envs.franka_env:BlocksEnv")

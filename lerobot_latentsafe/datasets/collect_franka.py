@@ -1,0 +1,197 @@
+"""Recording the simulated Franka in bulk, through the same robot and operators as lerobot-record.
+
+Episodes are recorded in parts of a few dozen, each a finished dataset of its own in `<root>.parts`, and put together at
+the end: a run that was killed goes on where its last finished part ends, and never leaves a broken dataset.
+Episode i depends on the seed and i only.
+"""
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lerobot_latentsafe.datasets.labels import FAILING, SAFE
+from lerobot_latentsafe.envs.scenes import SCENES
+from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, STATE_NAMES
+
+if TYPE_CHECKING:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
+
+EPISODES_A_PART = 50
+
+
+@dataclass(frozen=True)
+class Source:
+    """A dataset: its scene, how many episodes, and who moves the robot in each.
+
+    Attributes:
+        mix: behaviours of `teleoperators/scripted` with the number of episodes of each, in a dataset of full size;
+            smaller ones keep the proportions. Episodes of different behaviours are interleaved.
+        branches: episodes that start from each grasped state; 0 records whole episodes from the start.
+    """
+
+    scene: str
+    mix: dict[str, int]
+    variant: str | None = None
+    branches: int = 0
+
+    @property
+    def n_episodes(self) -> int:
+        return sum(self.mix.values())
+
+    def behavior(self, episode: int) -> str:
+        """Of an episode: behaviours follow each other in a fixed shuffle of the whole mix, over and over."""
+        names = np.repeat(list(self.mix), list(self.mix.values()))
+        return str(np.random.default_rng(0).permutation(names)[episode % len(names)])
+
+
+SOURCES: dict[str, Source] = {
+    "bag_mix": Source("bag", {"random": 1000, "open_end": 75, "middle": 75, "closed_end": 100, "side_to_side": 50}),
+    "bag_branches": Source("bag", {"branch": 500}, branches=5),
+    "bag_strong": Source("bag", {"middle": 100}),
+    "bag_weak": Source("bag", {"closed_end": 100}, variant="sealed"),
+    "blocks_demos": Source("blocks", {"pluck_careful": 120, "pluck_careless": 80}),
+    "blocks_random": Source("blocks", {"random": 200}),
+}
+"""What `latentsafe collect --source=...` can record of the Franka."""
+
+
+def features(source: Source) -> dict:
+    """The dataset's features; labels and rewards are no inputs of a policy (see `labels.py`)."""
+    size = SCENES[source.scene].image_size
+    image = {"dtype": "video", "shape": (size, size, 3), "names": ["height", "width", "channels"]}
+    return {
+        "observation.images.front": image,
+        "observation.images.wrist": dict(image),
+        "observation.state": {"dtype": "float32", "shape": (len(STATE_NAMES),), "names": STATE_NAMES},
+        "action": {"dtype": "float32", "shape": (len(ACTION_NAMES),), "names": ACTION_NAMES},
+        "failure": {"dtype": "int64", "shape": (1,), "names": None},
+        "next.reward": {"dtype": "float32", "shape": (1,), "names": None},
+        "next.success": {"dtype": "bool", "shape": (1,), "names": None},
+        "next.done": {"dtype": "bool", "shape": (1,), "names": None},
+    }
+
+
+def collect_franka(name: str, repo_id: str, root: str | Path, n_episodes: int | None, seed: int) -> "LeRobotDataset":
+    """Record a source, or go on recording it.
+
+    Args:
+        n_episodes: None takes the source's.
+
+    Raises:
+        ValueError: unknown source, or an unfinished recording of another source, seed or repo_id.
+        FileExistsError: root exists.
+    """
+    from lerobot.datasets.aggregate import aggregate_datasets
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from tqdm import tqdm
+
+    if name not in SOURCES:
+        raise ValueError(f"--source is {name!r}; expected one of {', '.join(SOURCES)}")
+    source, root = SOURCES[name], Path(root)
+    n_episodes = n_episodes or source.n_episodes
+    if root.exists():
+        raise FileExistsError(f"{root} exists; choose another --root or delete it")
+    parts = root.with_name(root.name + ".parts")
+    _claim(parts, f"{name} {repo_id} seed {seed}")
+    starts = range(0, n_episodes, EPISODES_A_PART)
+    for start in tqdm(starts, desc=f"collecting {name}", unit="part"):
+        end = min(start + EPISODES_A_PART, n_episodes)
+        part = parts / f"{start:06d}_{end:06d}"
+        if not part.exists():
+            unfinished = parts / "unfinished"
+            shutil.rmtree(unfinished, ignore_errors=True)
+            _record_part(source, repo_id, unfinished, range(start, end), seed)
+            unfinished.rename(part)
+    folders = [parts / f"{start:06d}_{min(start + EPISODES_A_PART, n_episodes):06d}" for start in starts]
+    together = parts / "together"
+    shutil.rmtree(together, ignore_errors=True)
+    aggregate_datasets([repo_id] * len(folders), repo_id, roots=folders, aggr_root=together)
+    together.rename(root)
+    shutil.rmtree(parts)
+    return LeRobotDataset(repo_id, root=root)
+
+
+def _claim(parts: Path, what: str) -> None:
+    """Note what the parts are of, and refuse to mix."""
+    note = parts / "of.txt"
+    if note.exists() and note.read_text() != what:
+        raise ValueError(f"{parts} holds an unfinished recording of {note.read_text()!r}, not {what!r}; delete it")
+    parts.mkdir(parents=True, exist_ok=True)
+    note.write_text(what)
+
+
+def _record_part(source: Source, repo_id: str, root: Path, episodes: range, seed: int) -> None:
+    from lerobot.configs.video import RGBEncoderConfig
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
+    from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
+
+    dataset = LeRobotDataset.create(
+        repo_id, SCENES[source.scene].fps, features(source), root=root, robot_type=LatentSafeFrankaMujoco.name,
+        streaming_encoding=True, encoder_threads=1, metadata_buffer_size=EPISODES_A_PART,
+        rgb_encoder=RGBEncoderConfig(vcodec="h264", preset="veryfast", crf=20),
+    )  # fmt: skip
+    robot = LatentSafeFrankaMujoco(LatentSafeFrankaMujocoConfig(scene=source.scene, variant=source.variant))
+    with robot:
+        for episode in episodes:
+            for frame in episode_frames(robot, source, episode, seed):
+                dataset.add_frame(frame)
+            dataset.save_episode()
+    dataset.finalize()
+
+
+def episode_frames(robot: "LatentSafeFrankaMujoco", source: Source, episode: int, seed: int) -> Iterator[dict]:
+    """The frames of an episode as `LeRobotDataset.add_frame` takes them; the first failing frame and all after fail."""
+    from lerobot_latentsafe.teleoperators.scripted.config_scripted import LatentSafeScriptedConfig
+    from lerobot_latentsafe.teleoperators.scripted.scripted import LatentSafeScripted
+
+    info, scene = SCENES[source.scene], robot.scene
+    start = episode // source.branches if source.branches else episode
+    robot.reset(_scene_seed(seed, start))
+    n_frames = round(info.episode_seconds * info.fps)
+    if source.branches:
+        n_frames -= _grasp(robot, _scene_seed(seed, start))
+    operator = LatentSafeScripted(LatentSafeScriptedConfig(behavior=source.behavior(episode), seed=episode))
+    failed = False
+    with operator:
+        for _ in range(n_frames):
+            failed |= bool(scene.truth()["failure"])
+            seen = robot.get_observation()
+            sent = robot.send_action(operator.get_action())
+            after = scene.truth()
+            yield {
+                "observation.images.front": seen["front"],
+                "observation.images.wrist": seen["wrist"],
+                "observation.state": np.array([seen[name] for name in STATE_NAMES], np.float32),
+                "action": np.array([sent[name] for name in ACTION_NAMES], np.float32),
+                "failure": np.array([FAILING if failed else SAFE]),
+                "next.reward": np.array([after["reward"]], np.float32),
+                "next.success": np.array([after["is_success"] and not failed]),
+                # Nothing ends by itself: an episode lasts its time, and its last state could go on.
+                "next.done": np.array([False]),
+                "task": scene.task,
+            }
+
+
+def _scene_seed(seed: int, start: int) -> int:
+    return 1_000_000 * seed + start
+
+
+def _grasp(robot: "LatentSafeFrankaMujoco", seed: int) -> int:
+    """Close the fingers on the bag, unrecorded: by its closed end in three of five cases. Returns the steps taken."""
+    from lerobot_latentsafe.envs import bag
+    from lerobot_latentsafe.teleoperators.scripted.behaviors import grasp
+
+    rng = np.random.default_rng([7, seed])
+    segment = rng.choice([bag.TAIL, bag.MIDDLE, bag.MOUTH], p=[0.6, 0.2, 0.2])
+    steps = 0
+    for steps, action in enumerate(grasp(robot.scene, int(segment), rng), 1):  # noqa: B007
+        robot.send_action(dict(zip(ACTION_NAMES, action.tolist())))
+    return steps

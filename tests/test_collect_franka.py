@@ -1,0 +1,112 @@
+import numpy as np
+import pytest
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from lerobot_latentsafe.datasets import collect_franka
+from lerobot_latentsafe.datasets.collect_franka import SOURCES, Source
+from lerobot_latentsafe.datasets.collect_franka import collect_franka as collect
+from lerobot_latentsafe.datasets.labels import FailureLabels
+
+COLUMNS = ("observation.state", "action", "failure", "next.reward", "episode_index")
+
+
+@pytest.fixture
+def tiny(monkeypatch):
+    """Blocks at 32 pixels, an episode a part."""
+    from dataclasses import replace
+
+    scene = replace(collect_franka.SCENES["blocks"], image_size=32)
+    monkeypatch.setitem(collect_franka.SCENES, "blocks", scene)
+    monkeypatch.setattr(collect_franka, "EPISODES_A_PART", 1)
+    monkeypatch.setitem(SOURCES, "tiny", Source("blocks", {"pluck_careless": 1, "pluck_careful": 1}))
+
+
+def columns(dataset):
+    return {name: np.array(dataset.hf_dataset[name]) for name in COLUMNS}
+
+
+def test_a_killed_recording_goes_on_and_equals_an_undisturbed_one(tiny, tmp_path, monkeypatch):
+    whole = columns(collect("tiny", "me/tiny", tmp_path / "whole", 2, seed=0))
+    record, left = collect_franka.episode_frames, iter([True, False])
+
+    def killed_in_the_second(*args):
+        frames = record(*args)
+        if next(left):
+            return frames
+        next(frames)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(collect_franka, "episode_frames", killed_in_the_second)
+    with pytest.raises(KeyboardInterrupt):
+        collect("tiny", "me/tiny", tmp_path / "cut", 2, seed=0)
+    assert not (tmp_path / "cut").exists()
+    calls = []
+    monkeypatch.setattr(collect_franka, "episode_frames", lambda *args: calls.append(args[2]) or record(*args))
+    resumed = columns(collect("tiny", "me/tiny", tmp_path / "cut", 2, seed=0))
+    assert calls == [1]  # the finished part was kept
+    for name in COLUMNS:
+        np.testing.assert_array_equal(resumed[name], whole[name])
+    assert [path.name for path in tmp_path.iterdir()].count("cut.parts") == 0
+
+    labels = FailureLabels.load(tmp_path / "whole")
+    for episode in range(2):
+        failing = labels.failure[labels.episode == episode]
+        assert (np.diff(failing) >= 0).all()  # one first failing frame, all later ones fail
+    assert set(labels.failure) == {0, 1}
+    dataset = LeRobotDataset("me/tiny", root=tmp_path / "whole")
+    assert dataset[0]["observation.images.front"].shape == (3, 32, 32)
+    assert dataset.meta.info.robot_type == "latentsafe_franka_mujoco" and dataset.num_frames == 120
+
+
+def test_branches_share_their_grasp_and_differ_after_it():
+    from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
+    from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
+
+    with LatentSafeFrankaMujoco(LatentSafeFrankaMujocoConfig(image_size=32)) as robot:
+        first = {}
+        for episode in (0, 1, 5):
+            frames = collect_franka.episode_frames(robot, SOURCES["bag_branches"], episode, 0)
+            first[episode] = [next(frames) for _ in range(4)]
+            assert robot.scene.held_segment() is not None
+    state = lambda episode, t: first[episode][t]["observation.state"]  # noqa: E731
+    np.testing.assert_array_equal(state(0, 0), state(1, 0))
+    assert np.abs(state(0, 3) - state(1, 3)).max() > 0
+    assert np.abs(state(0, 0) - state(5, 0)).max() > 0.01
+
+
+def test_mixes_keep_their_proportions():
+    source = SOURCES["bag_mix"]
+    assert source.n_episodes == 1300
+    names = [source.behavior(i) for i in range(1300)]
+    assert {name: names.count(name) for name in set(names)} == source.mix
+    assert 60 <= [*names[:100]].count("random") <= 90
+
+
+def test_bad_requests_are_refused(tiny, tmp_path):
+    with pytest.raises(ValueError, match=r"--source is 'jar'; expected one of bag_mix"):
+        collect("jar", "me/x", tmp_path / "x", 1, 0)
+    (tmp_path / "precious").write_text("data")
+    with pytest.raises(FileExistsError, match="another --root"):
+        collect("tiny", "me/x", tmp_path, 1, 0)
+    parts = tmp_path / "mine.parts"
+    parts.mkdir()
+    (parts / "of.txt").write_text("bag_mix me/other seed 1")
+    with pytest.raises(ValueError, match=r"unfinished recording of 'bag_mix me/other seed 1'.*delete it"):
+        collect("tiny", "me/x", tmp_path / "mine", 1, 0)
+
+
+def test_a_full_disk_leaves_finished_parts(tiny, tmp_path, monkeypatch):
+    import errno
+
+    record = collect_franka.episode_frames
+
+    def full_disk(robot, source, episode, seed):
+        if episode == 1:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return record(robot, source, episode, seed)
+
+    monkeypatch.setattr(collect_franka, "episode_frames", full_disk)
+    with pytest.raises(OSError, match="No space left"):
+        collect("tiny", "me/tiny", tmp_path / "x", 2, seed=0)
+    finished = LeRobotDataset("me/tiny", root=tmp_path / "x.parts" / "000000_000001")
+    assert finished.num_episodes == 1

@@ -1,0 +1,297 @@
+"""The real Franka's robot class against a fake driver that lags, stops and loses its gripper."""
+
+import logging
+import threading
+import time
+
+import numpy as np
+import pytest
+from lerobot.robots.utils import make_robot_from_config
+from lerobot.utils.errors import DeviceNotConnectedError
+
+from lerobot_latentsafe.robots.franka.config_franka import LatentSafeFrankaConfig
+from lerobot_latentsafe.robots.franka.driver import ArmState, FrankaError, FrankyDriver, GripperError
+from lerobot_latentsafe.robots.franka.franka import DOWN, LatentSafeFranka
+from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, GRIPPER_WIDTH, HOME, JOINT_NAMES, STATE_NAMES
+
+STILL = dict.fromkeys(ACTION_NAMES, 0.0) | {"gripper.pos": 1.0}
+START = np.array([0.45, 0.0, 0.30])
+
+
+class FakeDriver:
+    """An arm that covers a share of the way to its target with every call of `track`.
+
+    `reflex`: the arm has stopped until `recover`. `blocked`: it cannot move. `gripper_lost`: the hand is silent.
+    """
+
+    def __init__(self, follow: float = 0.3):
+        self.follow, self.joints = follow, HOME.copy()
+        self.position, self.rotation, self.width = START.copy(), DOWN, GRIPPER_WIDTH
+        self.tracked: list[np.ndarray] = []
+        self.calls: list[str] = []
+        self.started = self.reflex = self.blocked = self.gripper_lost = False
+        self.lock = threading.Lock()
+
+    def connect(self):
+        self.calls.append("connect")
+
+    def start(self):
+        self.calls.append("start")
+        self.started = True
+
+    def state(self):
+        if self.reflex:
+            raise FrankaError("cartesian reflex")
+        if self.gripper_lost:
+            raise GripperError("the gripper does not answer")
+        with self.lock:
+            return ArmState(self.joints.copy(), self.position.copy(), self.rotation, self.width)
+
+    def track(self, position, rotation):
+        if self.reflex:
+            raise FrankaError("cartesian reflex")
+        with self.lock:
+            self.tracked.append(position)
+            if not self.blocked:
+                self.position = self.position + self.follow * (position - self.position)
+                self.rotation = rotation
+
+    def move_joints(self, joints):
+        self.calls.append("move_joints")
+        self.joints = joints.copy()
+
+    def move_gripper(self, width):
+        self.calls.append(f"gripper {width:.3f}")
+        self.width = width
+
+    def recover(self):
+        self.calls.append("recover")
+        self.reflex = False
+
+    def stop(self):
+        self.calls.append("stop")
+        self.started = False
+
+    def disconnect(self):
+        self.calls.append("disconnect")
+
+
+def make(driver=None, **options):
+    return LatentSafeFranka(LatentSafeFrankaConfig(ip="172.16.0.2", **options), driver or FakeDriver())
+
+
+@pytest.fixture
+def robot():
+    made = make()
+    made.connect()
+    yield made
+    if made.is_connected:
+        made.driver.reflex = made.driver.gripper_lost = False
+        made.disconnect()
+
+
+def wait_for(condition, seconds=2.0):
+    until = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < until, "did not happen in time"
+        time.sleep(0.005)
+
+
+def test_features_are_the_simulations(robot):
+    assert list(robot.action_features) == ACTION_NAMES and list(robot.observation_features) == STATE_NAMES
+    seen = robot.get_observation()
+    assert list(seen) == STATE_NAMES and seen["gripper.pos"] == 1.0
+    np.testing.assert_allclose(
+        [seen[f"ee_{axis}.pos"] for axis in ("x", "y", "z", "rx", "ry", "rz")], [*START, 0, 0, 0]
+    )
+
+
+def test_a_delta_is_streamed_smoothly(robot):
+    sent = robot.send_action(STILL | {"delta_x.pos": 0.02})
+    assert sent["delta_x.pos"] == pytest.approx(0.02)
+    wait_for(lambda: abs(robot.driver.position[0] - 0.47) < 1e-3)
+    steps = np.diff([position[0] for position in robot.driver.tracked])
+    assert steps.max() < 0.02 and steps.min() > -1e-9  # in between, not in one jump
+
+
+def test_the_commanded_pose_stays_in_the_workspace_and_near_the_arm(robot):
+    robot.driver.blocked = True
+    for _ in range(5):
+        robot.send_action(STILL | {"delta_x.pos": 0.03, "delta_rz.pos": 0.13})
+    position, rotation = robot._stream.target()
+    assert position[0] == pytest.approx(START[0] + robot.config.max_lead)
+    assert (rotation * DOWN.inv()).magnitude() == pytest.approx(robot.config.max_lead_turn)
+    robot.driver.position = np.array([0.45, 0.0, 0.03])
+    sent = robot.send_action(STILL | {"delta_z.pos": -0.03})
+    for _ in range(3):
+        robot.send_action(STILL | {"delta_z.pos": -0.03})
+    assert robot._stream.target()[0][2] == pytest.approx(robot.config.workspace_low[2])
+    assert sent["delta_z.pos"] == pytest.approx(0.03 + 0.04 - 0.30)  # what was commanded, not what was asked
+
+
+def test_without_new_actions_the_arm_holds(robot, caplog):
+    robot.driver.follow = 0.01
+    with caplog.at_level(logging.WARNING):
+        robot.send_action(STILL | {"delta_y.pos": 0.03})
+        wait_for(lambda: "holding" in caplog.text)
+    assert robot._stream.target()[0][1] < 0.02
+
+
+def test_the_gripper_moves_when_the_wish_changes(robot):
+    for opening in (1.0, 0.98, 0.0, 0.0, 1.0):
+        robot.send_action(STILL | {"gripper.pos": opening})
+    assert [call for call in robot.driver.calls if call.startswith("gripper")] == ["gripper 0.000", "gripper 0.080"]
+
+
+def test_returning_to_the_start_is_a_slow_joint_move(robot):
+    goal = dict(zip(STATE_NAMES, [*(HOME + 0.1), 1.0, *START, 0, 0, 0]))
+    sent = robot.send_action(goal)
+    assert set(sent) == {*JOINT_NAMES, "gripper.pos"}
+    assert robot.driver.calls[-3:] == ["stop", "move_joints", "start"]
+    robot.send_action(goal)  # LeRobot repeats it at 50 Hz
+    assert robot.driver.calls.count("move_joints") == 1
+    robot.send_action(STILL)
+
+
+def test_reflexes_are_recovered_from_a_few_times(robot, caplog):
+    for _ in range(robot.config.max_recoveries):
+        robot.driver.reflex = True
+        assert robot.get_observation()["ee_x.pos"] == pytest.approx(START[0])
+        robot.send_action(STILL)
+    assert robot.driver.calls.count("recover") == 3 and "recovering (3 of 3)" in caplog.text
+    robot.driver.reflex = True
+    with pytest.raises(FrankaError, match="cartesian reflex"):
+        robot.send_action(STILL)
+
+
+def test_disconnecting_stops_the_arm_in_any_state(robot):
+    stream = robot._stream
+    robot.driver.gripper_lost = True
+    robot.disconnect()
+    assert robot.driver.calls[-2:] == ["stop", "disconnect"] and not stream.is_alive() and not robot.is_connected
+
+
+def test_monitor_mode_never_moves(caplog):
+    robot = make(monitor=True)
+    with caplog.at_level(logging.INFO):
+        robot.connect()
+        sent = robot.send_action(STILL | {"delta_x.pos": 0.02, "gripper.pos": 0.0})
+        robot.send_action(dict(zip(JOINT_NAMES, HOME + 0.2)))
+        robot.disconnect()
+    assert sent["delta_x.pos"] == pytest.approx(0.02) and "not executed" in caplog.text
+    assert set(robot.driver.calls) == {"connect", "disconnect"} and not robot.driver.tracked
+
+
+def test_lerobot_makes_it_from_its_configuration():
+    robot = make_robot_from_config(LatentSafeFrankaConfig(ip="172.16.0.2"))
+    assert isinstance(robot, LatentSafeFranka) and isinstance(robot.driver, FrankyDriver)
+
+
+# Bad input
+
+
+def test_a_lost_gripper_ends_the_episode(robot):
+    robot.driver.gripper_lost = True
+    with pytest.raises(GripperError, match="does not answer"):
+        robot.get_observation()
+
+
+def test_an_error_in_the_middle_of_an_episode_keeps_the_recording(robot, tmp_path):
+    """What lerobot-record does: frames until the driver fails, then finalize."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    features = {
+        "observation.state": {"dtype": "float32", "shape": (14,), "names": STATE_NAMES},
+        "action": {"dtype": "float32", "shape": (7,), "names": ACTION_NAMES},
+    }
+    dataset = LeRobotDataset.create("me/real", 15, features, root=tmp_path / "real", use_videos=False)
+    with pytest.raises(GripperError):
+        try:
+            for step in range(10):
+                robot.driver.gripper_lost = step == 6
+                seen = robot.get_observation()
+                sent = robot.send_action(STILL)
+                state = np.array([seen[name] for name in STATE_NAMES], np.float32)
+                action = np.array([sent[name] for name in ACTION_NAMES], np.float32)
+                dataset.add_frame({"observation.state": state, "action": action, "task": "x"})
+                if step == 4:
+                    dataset.save_episode()
+        finally:
+            dataset.finalize()
+    assert LeRobotDataset("me/real", root=tmp_path / "real").num_frames == 5
+
+
+def test_broken_actions_move_nothing(robot):
+    before = robot._stream.target()[0].copy()
+    for broken in (STILL | {"delta_x.pos": float("nan")}, {"delta_x": 1.0}):
+        with pytest.raises(ValueError, match=r"non-finite|expected delta_x\.pos"):
+            robot.send_action(broken)
+    np.testing.assert_array_equal(robot._stream.target()[0], before)
+
+
+def test_an_unconnected_robot_says_so():
+    robot = make()
+    for call in (robot.get_observation, lambda: robot.send_action(STILL), robot.disconnect):
+        with pytest.raises(DeviceNotConnectedError, match=r"call connect\(\) first"):
+            call()
+
+
+def test_a_camera_of_another_size_is_refused(robot):
+    class Camera:
+        height = width = 64
+
+        def async_read(self):
+            return np.zeros((48, 64, 3), np.uint8)
+
+        def disconnect(self):
+            pass
+
+    robot.cameras = {"front": Camera()}
+    robot.config.cameras = {"front": Camera()}
+    robot.__dict__.pop("observation_features", None)
+    with pytest.raises(ValueError, match=r"'front' gives images of shape \(48, 64, 3\), configured is \(64"):
+        robot.get_observation()
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"workspace_low": (0.8, 0, 0)}, "must be below workspace_high"),
+        ({"stiffness": -1.0}, "stiffness is -1"),
+        ({"watchdog": 0.05}, r"watchdog is 0\.05 s; at 15 Hz expected at least 0\.100 s"),
+    ],
+)
+def test_unsafe_options_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        LatentSafeFrankaConfig(ip="172.16.0.2", **options)
+
+
+def test_a_missing_driver_names_the_extra(monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "franky", None)
+    with pytest.raises(ImportError, match=r"pip install 'lerobot_policy_latentsafe\[franka\]'"):
+        make(FrankyDriver(LatentSafeFrankaConfig(ip="172.16.0.2"))).connect()
+
+
+def test_end_to_end_against_the_protocol_simulator():
+    """The real driver, over libfranka's protocol on loopback; needs the extra `franka` and franky-sim."""
+    pytest.importorskip("franky")
+    franky_sim = pytest.importorskip("franky_sim")
+    from franky_sim.mujoco_simulator import MujocoSimulator
+
+    with MujocoSimulator(enable_visualization=False) as simulator:
+        model = simulator.add_robot()
+        with franky_sim.SimulationServer(simulator) as server:
+            server.run_async()
+            robot = LatentSafeFranka(LatentSafeFrankaConfig(ip=model.hostname, realtime=False, watchdog=2.0))
+            robot.connect()
+            start = robot.get_observation()
+            goal = start["ee_z.pos"]
+            for _ in range(15):
+                robot.send_action(STILL | {"delta_z.pos": -0.004, "gripper.pos": start["gripper.pos"]})
+                goal -= 0.004
+                time.sleep(1 / 15)
+            time.sleep(1.0)
+            assert robot.get_observation()["ee_z.pos"] == pytest.approx(goal, abs=0.02)
+            robot.disconnect()
