@@ -6,6 +6,8 @@ explosions  random episodes in which MuJoCo warned, or anything moved faster tha
 doomed      steps between the last state from which some retreat spills nothing and the first candy seen outside
 leak        the grasped end predicted from proprioception alone, AUC of a held-out logistic regression
 plucks      careful and careless plucking
+recording   CPU seconds an episode by latentsafe collect
+balance     episodes, frames and failures of each whole dataset, driven as `latentsafe collect` drives them (no videos)
 render      frames a second against MuJoCo's default visual settings
 
 OMP_NUM_THREADS=1 python scripts/measure_franka.py spills variants ...
@@ -245,10 +247,36 @@ def recording(n: int) -> dict:
     return row
 
 
+def balance(n: int) -> dict:
+    """What each dataset of `latentsafe collect` holds at seed 0; n episodes of each at most."""
+    from lerobot_latentsafe.datasets.collect_franka import SOURCES, episode_frames
+    from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
+    from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
+
+    rows = {}
+    for name, source in SOURCES.items():
+        config = LatentSafeFrankaMujocoConfig(scene=source.scene, variant=source.variant, image_size=32)
+        failures, successes = [], []
+        with LatentSafeFrankaMujoco(config) as robot:
+            for episode in range(min(n, source.n_episodes)):
+                frames = list(episode_frames(robot, source, episode, 0))
+                failures.append([bool(frame["failure"][0]) for frame in frames])
+                successes.append(any(bool(frame["next.success"][0]) for frame in frames))
+        rows[name] = {
+            "episodes": len(failures),
+            "frames": sum(map(len, failures)),
+            "failing_episodes": sum(map(any, failures)),
+            "failing_frames": sum(map(sum, failures)),
+            "successful_episodes": sum(successes),
+        }
+        print(name, rows[name], flush=True)
+    return rows
+
+
 PARTS = {
     "spills": (spills, 100), "swings": (swings, 50), "variants": (variants, 50), "explosions": (explosions, 1000),
     "doomed": (doomed, 20), "leak": (leak, 400), "plucks": (plucks, 100), "render": (render, 400),
-    "recording": (recording, 20),
+    "recording": (recording, 20), "balance": (balance, 10_000),
 }  # fmt: skip
 
 

@@ -63,6 +63,16 @@ def test_joint_move_reaches_its_joints(blocks_scene):
     np.testing.assert_allclose(blocks_scene.controller.position, blocks_scene.tool_pose()[0], atol=0.02)
 
 
+def test_an_episode_does_not_depend_on_those_before_it():
+    used = make_scene("bag", image_size=64)
+    for _ in play(used, "closed_end", seed=1, steps=40):
+        pass
+    for scene in (used, fresh := make_scene("bag", image_size=64)):
+        for _ in play(scene, "closed_end", seed=2, steps=40):
+            pass
+    np.testing.assert_array_equal(used.data.qpos, fresh.data.qpos)
+
+
 def test_equal_seeds_are_equal_and_others_are_not(bag_scene):
     scenes = bag_scene, make_scene("bag", image_size=64)
     for scene in scenes:

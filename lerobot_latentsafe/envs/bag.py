@@ -128,15 +128,14 @@ class BagScene(FrankaScene):
     def _settle(self, heap: int) -> np.ndarray:
         """qpos of the bag along x around the origin with settled candies."""
         if heap not in self._settled:
-            data, rng = self.data, np.random.default_rng([heap, 7])
+            # In data of its own: what was simulated before must not change the last bit of it.
+            data, rng = mujoco.MjData(self.model), np.random.default_rng([heap, 7])
+            data.qpos[:9], data.ctrl[:9] = self.data.qpos[:9], self.data.ctrl[:9]
             data.qpos[self.bag_qpos : self.bag_qpos + 7] = [_x(0), 0, _z(), 1, 0, 0, 0]
             data.qpos[self.candy_qpos] = _heap(self.n_candies, self.variant.candy_radius, rng) - self.candy_origin
             for _ in range(round(0.8 / TIMESTEP)):
                 mujoco.mj_step(self.model, data)
             self._settled[heap] = data.qpos.copy()
-            qpos = data.qpos[:9].copy()
-            mujoco.mj_resetData(self.model, data)
-            data.qpos[:9], data.ctrl[:9] = qpos, np.append(self.controller.joints, [self.controller.finger] * 2)
         return self._settled[heap]
 
     def _move_bag(self, centre: np.ndarray, yaw: float) -> None:
@@ -283,7 +282,7 @@ def _scene(variant: Variant, n_candies: int) -> str:
     <geom type="box" contype="4" conaffinity="2" group="3" friction="0.9 0.01 0.001" solref="0.008 1" condim="4"/>
   </default>
   <default class="fold">
-    <joint type="hinge" pos="{-LENGTH / 2} 0 0" damping="0.0025" armature="2e-5"/>
+    <joint type="hinge" pos="{-LENGTH / 2} 0 0" damping="0.004" armature="2e-5"/>
   </default>
   <default class="candy">
     <joint type="slide"/>
@@ -307,7 +306,8 @@ def _segment(k: int, variant: Variant) -> str:
     if k == SEGMENTS:
         return ""
     if k == 0:
-        place, joints = f"{_x(0)} 0 {_z()}", '<freejoint name="bag"/>'
+        # The air's drag: without it the light tail whips around when it is let go.
+        place, joints = f"{_x(0)} 0 {_z()}", '<joint type="free" name="bag" damping="1e-3"/>'
     else:
         place = f"{LENGTH} 0 0"
         joints = f"""
