@@ -49,7 +49,7 @@ def spills(n: int) -> dict:
 
 
 def swings(n: int) -> dict:
-    return {f"{speed} m/s": share_spilling("side_to_side", speed, n) for speed in (0.08, 0.15, 0.25, 0.30)}
+    return {f"{speed} m/s": share_spilling("side_to_side", speed, n) for speed in (0.04, 0.08, 0.15, 0.25, 0.30)}
 
 
 def share_spilling(behavior: str, speed: float | None, n: int) -> dict:

@@ -282,7 +282,7 @@ def _scene(variant: Variant, n_candies: int) -> str:
     <geom type="box" contype="4" conaffinity="2" group="3" friction="0.9 0.01 0.001" solref="0.008 1" condim="4"/>
   </default>
   <default class="fold">
-    <joint type="hinge" pos="{-LENGTH / 2} 0 0" damping="0.004" armature="2e-5"/>
+    <joint type="hinge" pos="{-LENGTH / 2} 0 0" damping="0.0025" armature="2e-5"/>
   </default>
   <default class="candy">
     <joint type="slide"/>
@@ -306,8 +306,7 @@ def _segment(k: int, variant: Variant) -> str:
     if k == SEGMENTS:
         return ""
     if k == 0:
-        # The air's drag: without it the light tail whips around when it is let go.
-        place, joints = f"{_x(0)} 0 {_z()}", '<joint type="free" name="bag" damping="1e-3"/>'
+        place, joints = f"{_x(0)} 0 {_z()}", '<freejoint name="bag"/>'
     else:
         place = f"{LENGTH} 0 0"
         joints = f"""

@@ -30,6 +30,8 @@ CAMERAS = ("front", "wrist")
 TIMESTEP = 1 / 600
 REACH_TOLERANCE = 0.005
 """Distance of the inverse kinematics' solution beyond which a pose counts as out of reach, m."""
+MAX_ACCELERATION = 1e4
+"""Beyond this a solution of the contact forces is not believed, rad/s^2 or m/s^2; the light film has reached 5e3."""
 PHYSICS = mujoco.mjtState.mjSTATE_INTEGRATION
 
 VISUAL = """<visual>
@@ -120,6 +122,7 @@ class FrankaScene:
         self.tool = self.model.site("tcp").id
         self.fingers = [self.model.joint(f"finger_{side}").qposadr[0] for side in ("left", "right")]
         self._renderer = None
+        self._before = np.empty(mujoco.mj_stateSize(self.model, PHYSICS))
         self.controller = self._home()
         self.seed = 0
 
@@ -173,9 +176,26 @@ class FrankaScene:
             share = i / self.substeps
             data.ctrl[:7] = start + (end - start) * share
             self.set_fingers(control.finger + (finger - control.finger) * share, i)
-            mujoco.mj_step(self.model, data)
+            self._advance()
         control.joints, control.finger = end, float(finger)
         self._refresh()
+
+    def _advance(self) -> None:
+        """One time step.
+
+        Newton's method is fast, but once in some hundred thousand steps it returns contact forces that throw the bag
+        across the room. Such a step is repeated by conjugate gradients, which then find ordinary ones.
+        """
+        model, data = self.model, self.data
+        mujoco.mj_getState(model, data, self._before, PHYSICS)
+        velocity = data.qvel.copy()
+        mujoco.mj_step(model, data)
+        # Not data.qacc, which then looks as if nothing had happened.
+        if not np.abs(data.qvel - velocity).max() < MAX_ACCELERATION * TIMESTEP:
+            mujoco.mj_setState(model, data, self._before, PHYSICS)
+            newton, model.opt.solver = model.opt.solver, mujoco.mjtSolver.mjSOL_CG
+            mujoco.mj_step(model, data)
+            model.opt.solver = newton
 
     def set_fingers(self, travel: float, substep: int) -> None:
         """Command both fingers, m from closed; scenes in which the grasp is modelled add to it."""
