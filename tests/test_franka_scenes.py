@@ -1,5 +1,6 @@
 import logging
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -61,6 +62,17 @@ def test_joint_move_reaches_its_joints(blocks_scene):
         blocks_scene.move_joints(goal, 1.0)
     np.testing.assert_allclose(blocks_scene.proprioception()[:7], goal, atol=0.02)
     np.testing.assert_allclose(blocks_scene.controller.position, blocks_scene.tool_pose()[0], atol=0.02)
+
+
+@pytest.mark.parametrize("seed", [100_286, 100_329, 100_529])  # Newton's method alone threw these bags
+def test_bag_is_not_thrown_by_a_solver_that_fails(bag_scene, seed):
+    bag_scene.reset(seed)
+    actions, action = begin("random", bag_scene, None, np.random.default_rng([0, seed])), np.zeros(7)
+    for _ in range(45):
+        action = next(actions, np.append(np.zeros(6), action[6]))
+        bag_scene.step(action)
+        assert np.abs(bag_scene.data.qvel).max() < 12
+    assert bag_scene.model.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
 
 
 def test_an_episode_does_not_depend_on_those_before_it():
