@@ -42,12 +42,12 @@ def episode_values(policy: LatentSafePolicy, reader: ClipReader, episodes: np.nd
     device, rows = policy.device, []
     for episode in episodes:
         index = np.flatnonzero(reader.labels.episode == episode)
-        images, state = reader.cache.frames(index)
+        percepts, state = reader.cache.frames(index)
         state = policy.normalise_state(state.to(device))
         action = policy.normalise_action(torch.from_numpy(reader.cache.action[index]).to(device))
         latent, values = None, []
         for t in range(len(index)):
-            frame = {k: images[k][t : t + 1].to(device) for k in policy.world_model.image_keys}
+            frame = {k: percepts[k][t : t + 1].to(device) for k in policy.world_model.percept_names}
             previous = action[t - 1 : t] if t else None
             latent = policy.world_model.observe(latent, previous, frame, state[t : t + 1])
             values.append(policy.value(latent).item())

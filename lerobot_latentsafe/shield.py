@@ -152,7 +152,7 @@ class Shield:
             len(state), world_model.action_dim, device=state.device
         )  # fmt: skip
         predicted = world_model.step(latent, executed)
-        seen = world_model.correct(predicted, images, state)
+        seen = world_model.correct(predicted, world_model.perceive(images), state)
         blind = (fault >= Reason.OBSERVATION_NOT_FINITE) & (fault <= Reason.OBSERVATION_STALE)
         return replace_rows(seen, predicted, where=blind)
 

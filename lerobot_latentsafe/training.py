@@ -41,8 +41,8 @@ def encoded_starts(
         kept = clip.valid.flatten()
         z = policy.world_model.encode(clip)
         filtered.append(select({k: v.flatten(0, 1) for k, v in z.items()}, kept))
-        images = {k: v.flatten(0, 1)[kept] for k, v in clip.images.items()}
-        single.append(policy.world_model.observe(None, None, images, clip.state.flatten(0, 1)[kept]))
+        percepts = {k: v.flatten(0, 1)[kept] for k, v in clip.percepts.items()}
+        single.append(policy.world_model.observe(None, None, percepts, clip.state.flatten(0, 1)[kept]))
     pool: Latent = {k: torch.cat([z[k] for z in (*single, *filtered)]) for k in single[0]}
     size = len(next(iter(pool.values())))
 

@@ -100,7 +100,7 @@ def test_images_states_and_labels_belong_to_the_same_frames(clip_at):
     clip, policy = clip_at(2, FIRST[1]), clip_at.policy
     for row, start in enumerate((2, FIRST[1])):
         frames = start + np.arange(8)
-        np.testing.assert_allclose(clip.images["observation.image"][row, :, 0, 4, 4] * 255, 10 * frames, atol=1e-3)
+        np.testing.assert_allclose(clip.percepts["observation.image"][row, :, 0, 4, 4] * 255, 10 * frames, atol=1e-3)
         state = clip.state[row] * policy.state_std + policy.state_mean
         np.testing.assert_allclose(state[:, 0], frames, atol=1e-4)
         np.testing.assert_array_equal(clip.failure[row], frames % 2)
@@ -113,7 +113,7 @@ def test_nothing_past_the_episodes_end_is_valid(clip_at, start, inside):
     assert clip.valid[0].tolist() == [True] * inside + [False] * (8 - inside)
     if inside < 8:  # padded with the last frame, not with the next episode
         last = start + inside - 1
-        np.testing.assert_allclose(clip.images["observation.image"][0, inside:, 0, 4, 4] * 255, 10 * last, atol=1e-3)
+        np.testing.assert_allclose(clip.percepts["observation.image"][0, inside:, 0, 4, 4] * 255, 10 * last, atol=1e-3)
 
 
 def test_what_is_not_valid_is_not_learned_from(clip_at, monkeypatch):

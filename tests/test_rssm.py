@@ -64,7 +64,7 @@ def test_encode_is_repeated_observe(model):
     encoded, latent = model.encode(clip), None
     for t in range(5):
         latent = model.observe(
-            latent, clip.action[:, t] if t else None, {KEY: clip.images[KEY][:, t]}, clip.state[:, t]
+            latent, clip.action[:, t] if t else None, {KEY: clip.percepts[KEY][:, t]}, clip.state[:, t]
         )
         assert_same(latent, map_latent(encoded, lambda z, t=t: z[:, t]))
 
@@ -81,7 +81,7 @@ def test_rows_of_a_batch_do_not_mix(model):
     alone = tiny.random_clip(batch=1)
     for name in ("state", "action", "is_first"):
         setattr(alone, name, getattr(clip, name)[1:2])
-    alone.images = {KEY: clip.images[KEY][1:2]}
+    alone.percepts = {KEY: clip.percepts[KEY][1:2]}
     together = map_latent(model.encode(clip), lambda t: t[1:2])
     assert_same(model.encode(alone), together)
 
@@ -89,7 +89,7 @@ def test_rows_of_a_batch_do_not_mix(model):
 def test_nothing_before_the_first_frame_matters(model):
     clip, other = tiny.random_clip(length=6), tiny.random_clip(length=6)
     clip.is_first[:, 3] = True
-    for old, new in ((other.images[KEY], clip.images[KEY]), (other.state, clip.state), (other.action, clip.action)):
+    for old, new in ((other.percepts[KEY], clip.percepts[KEY]), (other.state, clip.state), (other.action, clip.action)):
         old[:, 3:] = new[:, 3:]
     other.is_first = clip.is_first
     assert_same(*(map_latent(model.encode(c), lambda t: t[:, 3:]) for c in (clip, other)))
@@ -104,7 +104,7 @@ def test_training_also_forgets_at_the_first_frame():
     for c in (clip, other):
         c.is_first[:, 3] = True
         c.valid[:, :3] = False
-    for old, new in ((other.images[KEY], clip.images[KEY]), (other.state, clip.state), (other.action, clip.action)):
+    for old, new in ((other.percepts[KEY], clip.percepts[KEY]), (other.state, clip.state), (other.action, clip.action)):
         old[:, 3:] = new[:, 3:]
     losses = []
     for c in (clip, other):
@@ -140,7 +140,7 @@ def test_mean_image_is_learned_in_training_only():
     model.eval().loss(clip)
     assert model.mean_observation_image.eq(0).all()
     model.train().loss(clip)
-    torch.testing.assert_close(model.mean_observation_image, clip.images[KEY].mean((0, 1)))
+    torch.testing.assert_close(model.mean_observation_image, clip.percepts[KEY].mean((0, 1)))
     learned = model.mean_observation_image.clone()
     model.eval().loss(tiny.random_clip())
     torch.testing.assert_close(model.mean_observation_image, learned)

@@ -144,7 +144,7 @@ def random_clip(batch=3, length=5, size=32, action_dim=ACTION_DIM, state_dim=2, 
     is_first = torch.zeros(batch, length, dtype=torch.bool)
     is_first[:, 0] = True
     return Clip(
-        images={key: torch.rand(batch, length, 3, size, size)},
+        percepts={key: torch.rand(batch, length, 3, size, size)},
         state=torch.randn(batch, length, state_dim),
         action=torch.where(is_first[..., None], 0.0, 2 * torch.rand(batch, length, action_dim) - 1),
         is_first=is_first,

@@ -70,12 +70,13 @@ class ClipReader:
         index = batch["index"].reshape(-1).cpu().numpy()
         if self.cache is not None:
             return self.cut(index, policy)
-        images = {k: policy.model_images(batch[k]) for k in policy.world_model.image_keys}
         valid = ~batch["observation.state_is_pad"]
+        images = {k: policy.model_images(batch[k]).flatten(0, 1) for k in policy.world_model.image_keys}
+        percepts = {k: v.unflatten(0, valid.shape) for k, v in policy.world_model.perceive(images).items()}
         # LeRobot drops the last axis of features of a single number.
         state, action = (batch[k].reshape(*valid.shape, -1) for k in ("observation.state", "action"))
         window = np.minimum(index[:, None] + np.arange(self.length), len(self.labels.failure) - 1)
-        return self._assemble(window, images, state, action, valid, policy)
+        return self._assemble(window, percepts, state, action, valid, policy)
 
     def cut(self, start: np.ndarray, policy: "LatentSafePolicy") -> Clip:
         """Clips from the frame cache that start at the given frame indices (B,)."""
@@ -84,13 +85,13 @@ class ClipReader:
         valid = (window == inside) & (self.labels.episode[inside] == self.labels.episode[start][:, None])
         last = start + valid.sum(1) - 1
         window = np.minimum(window, last[:, None])
-        images, state = self.cache.frames(window)
-        images = {key: images[key].to(policy.device) for key in policy.world_model.image_keys}
+        percepts, state = self.cache.frames(window)
+        percepts = {key: percepts[key].to(policy.device) for key in policy.world_model.percept_names}
         action = torch.from_numpy(self.cache.action[np.maximum(window - 1, 0)])
-        return self._assemble(window, images, state, action, torch.from_numpy(valid), policy)
+        return self._assemble(window, percepts, state, action, torch.from_numpy(valid), policy)
 
     def _assemble(
-        self, window: np.ndarray, images: dict[str, Tensor], state: Tensor, action: Tensor, valid: Tensor,
+        self, window: np.ndarray, percepts: dict[str, Tensor], state: Tensor, action: Tensor, valid: Tensor,
         policy: "LatentSafePolicy",
     ) -> Clip:  # fmt: skip
         device = policy.device
@@ -98,7 +99,7 @@ class ClipReader:
         is_first[:, 0] = True
         action = policy.normalise_action(action.to(device).float()).clamp(-1, 1)
         return Clip(
-            images=images,
+            percepts=percepts,
             state=policy.normalise_state(state.to(device)),
             action=torch.where(is_first[..., None], 0.0, action),
             is_first=is_first,

@@ -87,7 +87,9 @@ class LatentMonitor:
         seen = dubins.observe(states, self.renderer)
         image = torch.from_numpy(seen["image"]).permute(0, 3, 1, 2).to(self.policy.device)
         images = {key: self.policy.model_images(image) for key in self.policy.world_model.image_keys}
-        return images, self.policy.normalise_state(torch.from_numpy(seen["heading"]).to(self.policy.device))
+        return self.policy.world_model.perceive(images), self.policy.normalise_state(
+            torch.from_numpy(seen["heading"]).to(self.policy.device)
+        )
 
 
 class PrivilegedMonitor:

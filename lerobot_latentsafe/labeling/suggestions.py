@@ -89,9 +89,9 @@ def _margins(policy, frames: DatasetFrames, episodes: list[int]) -> list[np.ndar
     is_first = torch.zeros_like(valid)
     is_first[:, 0] = True
     unknown = torch.full(valid.shape, -1)
-    images = {key: stack([images[key] for images, _, _ in seen]) for key in policy.world_model.image_keys}
+    percepts = {key: stack([row[key] for row, _, _ in seen]) for key in policy.world_model.percept_names}
     clip = Clip(
-        images, stack([state for _, state, _ in seen]), previous, is_first.to(policy.device), valid, unknown, unknown
+        percepts, stack([state for _, state, _ in seen]), previous, is_first.to(policy.device), valid, unknown, unknown
     )
     with torch.no_grad():
         margin = policy.margin.bounded(policy.world_model.features(policy.world_model.encode(clip))).cpu().numpy()
@@ -99,7 +99,7 @@ def _margins(policy, frames: DatasetFrames, episodes: list[int]) -> list[np.ndar
 
 
 def _model_inputs(policy, frames: DatasetFrames, episode: int):
-    """Images, proprioception and normalised actions of an episode, as the world model takes them."""
+    """Percepts, proprioception and normalised actions of an episode, as the world model takes them."""
     import torch
 
     images = {
@@ -108,7 +108,11 @@ def _model_inputs(policy, frames: DatasetFrames, episode: int):
     }
     columns = frames.columns(episode, ["observation.state", "action"])
     state, action = (torch.from_numpy(c).float().reshape(len(c), -1).to(policy.device) for c in columns.values())
-    return images, policy.normalise_state(state), policy.normalise_action(action).clamp(-1, 1)
+    return (
+        policy.world_model.perceive(images),
+        policy.normalise_state(state),
+        policy.normalise_action(action).clamp(-1, 1),
+    )
 
 
 class Suggester:

@@ -35,7 +35,7 @@ class Clip:
     """A batch of aligned windows of episodes, what a world model trains on.
 
     Attributes:
-        images: camera key -> (B, T, C, H, W) in [0, 1].
+        percepts: what `WorldModel.perceive` makes of each frame's images: name -> (B, T, ...).
         state: (B, T, S) proprioception.
         action: (B, T, A) in [-1, 1], the action that led to each frame; zero where is_first.
         is_first: bool (B, T), frames with no past.
@@ -44,7 +44,7 @@ class Clip:
         terminal: (B, T), 1 where the episode is over, 0 where it goes on, -1 unknown.
     """
 
-    images: dict[str, Tensor]
+    percepts: dict[str, Tensor]
     state: Tensor
     action: Tensor
     is_first: Tensor
@@ -78,6 +78,8 @@ class WorldModel(nn.Module, abc.ABC):
     """z_t ~ encoder(z_t | z_hat_t, o_t), z_hat_{t+1} ~ transition(z_t, a_t) (Section III)."""
 
     feature_dim: int
+    action_dim: int
+    image_keys: list[str]
 
     @abc.abstractmethod
     def initial(self, batch_size: int) -> Latent:
@@ -87,9 +89,25 @@ class WorldModel(nn.Module, abc.ABC):
     def step(self, latent: Latent, action: Tensor) -> Latent:
         """Imagine: next latent (B, ...) under actions (B, A) in [-1, 1]."""
 
+    @property
+    def percept_names(self) -> list[str]:
+        """Keys of what `perceive` returns."""
+        return self.image_keys
+
+    def perceive(self, images: dict[str, Tensor]) -> dict[str, Tensor]:
+        """The part of seeing that is never trained, and that a cache can therefore keep: by default the images.
+
+        Args:
+            images: camera key -> (B, C, H, W) in [0, 1].
+
+        Returns:
+            name -> (B, ...).
+        """
+        return images
+
     @abc.abstractmethod
-    def correct(self, predicted: Latent, images: dict[str, Tensor], state: Tensor) -> Latent:
-        """Posterior of a predicted latent given an observation: images (B, C, H, W) in [0, 1], state (B, S)."""
+    def correct(self, predicted: Latent, percepts: dict[str, Tensor], state: Tensor) -> Latent:
+        """Posterior of a predicted latent given an observation: percepts (B, ...), state (B, S)."""
 
     @abc.abstractmethod
     def features(self, latent: Latent) -> Tensor:
@@ -103,12 +121,14 @@ class WorldModel(nn.Module, abc.ABC):
     def loss(self, clip: Clip) -> tuple[Tensor, Tensor, dict[str, float]]:
         """Training loss, features (B, T, D) of the posterior for the co-trained margin, and metrics."""
 
-    def observe(self, latent: Latent | None, action: Tensor | None, images: dict[str, Tensor], state: Tensor) -> Latent:
+    def observe(
+        self, latent: Latent | None, action: Tensor | None, percepts: dict[str, Tensor], state: Tensor
+    ) -> Latent:
         """Posterior after acting and seeing: one tick of the filter. `latent` None starts an episode."""
         if latent is None:
             latent = self.initial(len(state))
             action = torch.zeros(len(state), self.action_dim, device=state.device)
-        return self.correct(self.step(latent, action), images, state)
+        return self.correct(self.step(latent, action), percepts, state)
 
     def encode(self, clip: Clip) -> Latent:
         """Filtered posteriors of every frame of a clip: tensors (B, T, ...)."""
@@ -116,9 +136,7 @@ class WorldModel(nn.Module, abc.ABC):
         latent = fresh = self.initial(len(clip.state))
         for t in range(clip.state.shape[1]):
             latent = replace_rows(latent, fresh, where=clip.is_first[:, t])
-            images = {key: value[:, t] for key, value in clip.images.items()}
-            latent = self.correct(self.step(latent, clip.action[:, t]), images, clip.state[:, t])
+            percepts = {key: value[:, t] for key, value in clip.percepts.items()}
+            latent = self.correct(self.step(latent, clip.action[:, t]), percepts, clip.state[:, t])
             latents.append(latent)
         return {key: torch.stack([z[key] for z in latents], 1) for key in latents[0]}
-
-    action_dim: int

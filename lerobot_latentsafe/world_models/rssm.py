@@ -182,8 +182,8 @@ class RSSM(WorldModel):
     def step(self, latent: Latent, action: Tensor) -> Latent:
         return self._with_prior(self._recur(latent["h"], latent["x"], action))
 
-    def correct(self, predicted: Latent, images: dict[str, Tensor], state: Tensor) -> Latent:
-        mean, std = self._posterior(predicted["h"], self.embed(images, state))
+    def correct(self, predicted: Latent, percepts: dict[str, Tensor], state: Tensor) -> Latent:
+        mean, std = self._posterior(predicted["h"], self.embed(percepts, state))
         return {"h": predicted["h"], "x": mean, "std": std}
 
     def features(self, latent: Latent) -> Tensor:
@@ -234,7 +234,7 @@ class RSSM(WorldModel):
         if self.training:
             self._update_mean_image(clip)
         batch, length = clip.state.shape[:2]
-        images = {key: value.flatten(0, 1) for key, value in clip.images.items()}
+        images = {key: value.flatten(0, 1) for key, value in clip.percepts.items()}
         embedding = self.embed(images, clip.state.flatten(0, 1)).unflatten(0, (batch, length))
         h, x, mean, std = self._filter_sampled(embedding, clip)
         features = torch.cat([x, h], -1)
@@ -303,7 +303,7 @@ class RSSM(WorldModel):
         self.mean_count += 1
         for key, name in self.cameras.items():
             mean = getattr(self, f"mean_{name}")
-            mean.lerp_(clip.images[key].mean((0, 1)), float(1 / self.mean_count))
+            mean.lerp_(clip.percepts[key].mean((0, 1)), float(1 / self.mean_count))
 
 
 def _gaussian_kl(mean1: Tensor, std1: Tensor, mean2: Tensor, std2: Tensor) -> Tensor:
