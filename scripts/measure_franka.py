@@ -7,7 +7,7 @@ doomed      steps between the last state from which some retreat spills nothing 
 leak        the grasped end predicted from proprioception alone, AUC of a held-out logistic regression
 plucks      careful and careless plucking
 recording   CPU seconds an episode by latentsafe collect
-balance     episodes, frames and failures of each whole dataset, driven as `latentsafe collect` drives them (no videos)
+balance     episodes, frames and failures of each dataset that scripts/collect_franka.sh recorded into data/
 render      frames a second against MuJoCo's default visual settings
 
 OMP_NUM_THREADS=1 python scripts/measure_franka.py spills variants ...
@@ -248,26 +248,25 @@ def recording(n: int) -> dict:
 
 
 def balance(n: int) -> dict:
-    """What each dataset of `latentsafe collect` holds at seed 0; n episodes of each at most."""
-    from lerobot_latentsafe.datasets.collect_franka import SOURCES, episode_frames
-    from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
-    from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
+    """What each dataset recorded by scripts/collect_franka.sh holds; its first n episodes at most."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from lerobot_latentsafe.datasets.collect_franka import SOURCES
+    from lerobot_latentsafe.datasets.labels import FAILING
 
     rows = {}
-    for name, source in SOURCES.items():
-        config = LatentSafeFrankaMujocoConfig(scene=source.scene, variant=source.variant, image_size=32)
-        failures, successes = [], []
-        with LatentSafeFrankaMujoco(config) as robot:
-            for episode in range(min(n, source.n_episodes)):
-                frames = list(episode_frames(robot, source, episode, 0))
-                failures.append([bool(frame["failure"][0]) for frame in frames])
-                successes.append(any(bool(frame["next.success"][0]) for frame in frames))
+    for name in SOURCES:
+        columns = LeRobotDataset(f"latentsafe/{name}", root=Path("data") / name).hf_dataset.with_format("numpy")
+        episode = np.asarray(columns["episode_index"])
+        kept = episode < n
+        failing = (np.asarray(columns["failure"]).reshape(-1) == FAILING) & kept
+        success = np.asarray(columns["next.success"]).reshape(-1) & kept
         rows[name] = {
-            "episodes": len(failures),
-            "frames": sum(map(len, failures)),
-            "failing_episodes": sum(map(any, failures)),
-            "failing_frames": sum(map(sum, failures)),
-            "successful_episodes": sum(successes),
+            "episodes": len(set(episode[kept])),
+            "frames": int(kept.sum()),
+            "failing_episodes": len(set(episode[failing])),
+            "failing_frames": int(failing.sum()),
+            "successful_episodes": len(set(episode[success])),
         }
         print(name, rows[name], flush=True)
     return rows
