@@ -50,14 +50,16 @@ def _digest(file: Path) -> str:
 
 TRAINED = (
     "stage", "world_model", "cameras", "fps", "state_names", "action_names", "action_low", "action_high",
-    "action_varies", "state_mean", "state_std", "action_candidates",
+    "action_varies", "state_mean", "state_std", "action_candidates", "kept_commands", "fallback_low", "fallback_high",
 )  # fmt: skip
 """Entries of config.json that belong to the weights; epsilon, mode, device and the like are the user's."""
 
 
 def _trained_digest(folder: Path) -> str:
     config = json.loads((folder / "config.json").read_text())
-    return hashlib.sha256(json.dumps({k: config.get(k) for k in TRAINED}, sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(
+        json.dumps({k: config[k] for k in TRAINED if k in config}, sort_keys=True).encode()
+    ).hexdigest()
 
 
 def seal(folder: Path) -> None:

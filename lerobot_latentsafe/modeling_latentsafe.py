@@ -62,14 +62,23 @@ class LatentSafePolicy(PreTrainedPolicy):
         candidates = None
         if config.action_candidates is not None:
             candidates = self.normalise_action(torch.tensor(config.action_candidates, dtype=torch.float32))
-        self.critic = SafetyCritic(
-            self.world_model.feature_dim, n_actions, candidates, config.reachability, self.action_varies
-        )
-        self.imagination = LatentImagination(self.world_model, self.margin)
+        kept = torch.tensor([name in config.kept_commands for name in config.action_names])
+        self.register_buffer("kept", kept, persistent=False)
+        self.critic = self.new_critic(candidates)
+        self.imagination = LatentImagination(self.world_model, self.margin, self.kept)
         self._base: list[BasePolicy] = []  # in a list, so that its weights are not ours
         self.shield = Shield(self)
         if config.base_policy_path:
             self.attach(config.base_policy_path)
+
+    def new_critic(self, candidates: Tensor | None) -> SafetyCritic:
+        """A critic with fresh weights, bounded to the commands the fallback may move."""
+        moves = self.action_varies & ~self.kept
+        low, high = self.config.fallback_low, self.config.fallback_high
+        low = torch.tensor(low) if low else -torch.ones(len(moves))
+        high = torch.tensor(high) if high else torch.ones(len(moves))
+        sizes = self.world_model.feature_dim, len(moves), candidates, self.config.reachability
+        return SafetyCritic(*sizes, low.to(moves.device) * moves, high.to(moves.device) * moves).to(moves.device)
 
     # -- units ---
 
@@ -84,6 +93,10 @@ class LatentSafePolicy(PreTrainedPolicy):
     def denormalise_action(self, action: Tensor) -> Tensor:
         """[-1, 1] -> robot units."""
         return self.action_low + (action + 1) / 2 * (self.action_high - self.action_low)
+
+    def first_action(self, action: Tensor) -> Tensor:
+        """What counts as having led to the first frame of an episode: no motion, kept commands as in `action`."""
+        return torch.where(self.kept, action, 0.0)
 
     def normalise_state(self, state: Tensor) -> Tensor:
         return (state.float() - self.state_mean) / self.state_std

@@ -38,12 +38,19 @@ class Imagination(Protocol):
     def ended(self, latent: Latent) -> Tensor:
         """Whether the episode is over in this latent: bool (B,). Nothing can fail after that."""
 
+    def complete(self, latent: Latent, action: Tensor) -> Tensor:
+        """The action (B, A) with the commands that a fallback leaves as they were before this latent."""
+
 
 class LatentImagination:
-    """A world model and failure margin behind the `Imagination` protocol."""
+    """A world model and failure margin behind the `Imagination` protocol.
 
-    def __init__(self, world_model: WorldModel, margin: FailureMargin):
-        self.world_model, self.failure_margin = world_model, margin
+    Args:
+        kept: bool (A,), commands that a fallback keeps as they were, such as a gripper's.
+    """
+
+    def __init__(self, world_model: WorldModel, margin: FailureMargin, kept: Tensor):
+        self.world_model, self.failure_margin, self.kept = world_model, margin, kept
 
     def step(self, latent: Latent, action: Tensor) -> Latent:
         return self.world_model.step(latent, action)
@@ -56,6 +63,9 @@ class LatentImagination:
 
     def margin(self, latent: Latent) -> Tensor:
         return self.failure_margin.bounded(self.world_model.features(latent))
+
+    def complete(self, latent: Latent, action: Tensor) -> Tensor:
+        return torch.where(self.kept.to(action.device), latent["action"], action)
 
 
 def safety_bellman_target(margin: Tensor, next_value: Tensor, gamma: float) -> Tensor:
@@ -73,6 +83,8 @@ class ReachabilityConfig:
     Attributes:
         critic_hidden, actor_hidden: widths of the hidden layers.
         activation: `tanh` or `relu`.
+        coverage: share of the data's actions left out at either end of the range that a continuous fallback may use:
+            where actions are rare in the data, the world model only guesses.
         components: principal components of the features that actor and critic read.
         horizon: imagined steps before a start is drawn anew (at most 25 in the paper).
         kept: the first steps of these whose states are learned on; the later ones only say what came of them. That
@@ -92,6 +104,7 @@ class ReachabilityConfig:
     critic_hidden: tuple[int, ...] = (128, 128, 128)
     actor_hidden: tuple[int, ...] = (256, 256)
     activation: str = "relu"
+    coverage: float = 0.02
     components: int = 16
     horizon: int = 25
     kept: int = 8
@@ -127,7 +140,7 @@ class SafetyCritic(nn.Module):
         feature_dim: D.
         action_dim: A.
         candidates: (K, A) in [-1, 1], the discrete action set, or None for continuous actions.
-        varies: bool (A,), the commands a continuous policy may move; the others stay at 0, all by default.
+        low, high: (A,) in [-1, 1], the range of a continuous policy's commands; by default all of it.
     """
 
     def __init__(
@@ -136,15 +149,16 @@ class SafetyCritic(nn.Module):
         action_dim: int,
         candidates: Tensor | None,
         config: ReachabilityConfig,
-        varies: Tensor | None = None,
+        low: Tensor | None = None,
+        high: Tensor | None = None,
     ):
         super().__init__()
         n_components = min(config.components, feature_dim)
         self.register_buffer("feature_mean", torch.zeros(feature_dim))
         self.register_buffer("projection", torch.eye(feature_dim, n_components))
         self.register_buffer("candidates", candidates)
-        varies = torch.ones(action_dim) if varies is None else varies.float()
-        self.register_buffer("varies", varies, persistent=False)
+        self.register_buffer("low", -torch.ones(action_dim) if low is None else low, persistent=False)
+        self.register_buffer("high", torch.ones(action_dim) if high is None else high, persistent=False)
         self.discrete = candidates is not None
         n_out = len(candidates) if self.discrete else 1
         n_in = n_components + (0 if self.discrete else action_dim)
@@ -173,22 +187,27 @@ class SafetyCritic(nn.Module):
         """(K, A) actions worth holding: the candidates, or standing still and the extremes of each command."""
         if self.discrete:
             return self.candidates
-        each = torch.diag(self.varies)[self.varies > 0]
-        return torch.cat([torch.zeros_like(each[:1]), each, -each])
+        moves = self.high > self.low
+        extremes = [torch.diag(bound)[moves] for bound in (self.high, self.low)]
+        return torch.cat([torch.zeros_like(self.low)[None], *extremes])
+
+    def between(self, share: Tensor) -> Tensor:
+        """Continuous actions at these shares in [0, 1] of their ranges: (..., A)."""
+        return torch.lerp(self.low, self.high, share)
 
     def best_q(self, x: Tensor) -> Tensor:
         """max_a Q over projected features (..., D) -> (...,)."""
         return self.q(x).amax(-1) if self.discrete else self.q_of(x, self.act(x))
 
     def q_of(self, x: Tensor, action: Tensor) -> Tensor:
-        """Q(z, a) for continuous actions (..., A)."""
-        return self.q(torch.cat([x, action], -1)).squeeze(-1)
+        """Q(z, a) for continuous actions (..., A), of which only the commands that this policy moves are read."""
+        return self.q(torch.cat([x, action * (self.high > self.low)], -1)).squeeze(-1)
 
     def act(self, x: Tensor) -> Tensor:
         """The fallback action argmax_a Q in [-1, 1]: (..., D) -> (..., A)."""
         if self.discrete:
             return self.candidates[self.q(x).argmax(-1)]
-        return torch.tanh(self.actor(x)) * self.varies
+        return self.between(torch.sigmoid(2 * self.actor(x)))
 
     def value(self, features: Tensor, margin: Tensor) -> Tensor:
         """V = min(l, max_a Q) at raw features (..., D) with bounded margin (...,)."""
@@ -218,7 +237,8 @@ def look_ahead(
     """
     if horizon == 0 and critic is not None:
         features = imagination.features(latent)
-        return critic.value(features, imagination.margin(latent)), critic.fallback(features)
+        action = imagination.complete(latent, critic.fallback(features))
+        return critic.value(features, imagination.margin(latent)), action
     now = imagination.margin(latent)
     n, n_policies = len(now), len(held) + (critic is not None)
     z = map_latent(latent, lambda t: t.repeat(n_policies, *[1] * (t.dim() - 1)))
@@ -228,6 +248,7 @@ def look_ahead(
         if critic is not None:
             follower = map_latent(z, lambda x: x[len(held) * n :])
             action = torch.cat([action[: len(held) * n], critic.fallback(imagination.features(follower))])
+        action = imagination.complete(z, action)
         first = action if t == 0 else first
         z = imagination.step(z, action)
         worst = torch.where(over, worst, torch.minimum(worst, imagination.margin(z)))
@@ -294,6 +315,7 @@ class LatentReachability:
             x = critic.project(features)
             held = torch.where((self._rand(n) < config.switch)[:, None], self._random_actions(n), held)
             action, choice = self._explore(x, greedy, held)
+            action = self.imagination.complete(latent, action)
             if critic.discrete and t < self.kept:
                 tried = critic.candidates.unsqueeze(0).expand(n, -1, -1)
             else:
@@ -341,8 +363,8 @@ class LatentReachability:
         """(n, A): the index of a candidate in the first column, or an action if they are continuous."""
         critic = self.critic
         if critic.discrete:
-            return torch.randint(len(critic.candidates), (n, 1), generator=self.generator, device=critic.varies.device)
-        return (2 * self._rand(n, len(critic.varies)) - 1) * critic.varies
+            return torch.randint(len(critic.candidates), (n, 1), generator=self.generator, device=critic.low.device)
+        return critic.between(self._rand(n, len(critic.low)))
 
     def _explore(self, x: Tensor, greedy: Tensor, held: Tensor) -> tuple[Tensor, Tensor]:
         """Actions (n, A) and the index of the successor they lead to (n,)."""
@@ -351,8 +373,9 @@ class LatentReachability:
             choice = torch.where(greedy, critic.q(x).argmax(-1), held[:, 0])
             return critic.candidates[choice], choice
         action = critic.act(x)
-        noise = 0.3 * torch.randn(action.shape, generator=self.generator, device=x.device) * critic.varies
-        action = torch.where(greedy[:, None], (action + noise).clamp(-1, 1), held)
+        noise = 0.15 * torch.randn(action.shape, generator=self.generator, device=x.device)
+        action = (action + noise * (critic.high - critic.low)).clamp(critic.low, critic.high)
+        action = torch.where(greedy[:, None], action, held)
         return action, torch.zeros(len(x), dtype=torch.long, device=x.device)
 
     def _rand(self, *shape: int) -> Tensor:
@@ -440,5 +463,5 @@ class LatentReachability:
     def _actor_objective(self, x: Tensor) -> Tensor:
         """Mean Q of the actor's actions, with the critic's weights held fixed."""
         frozen = {name: p.detach() for name, p in self.critic.q.named_parameters()}
-        inputs = torch.cat([x, self.critic.act(x)], -1)
+        inputs = torch.cat([x, self.critic.act(x) * (self.critic.high > self.critic.low)], -1)
         return torch.func.functional_call(self.critic.q, frozen, (inputs,)).mean()

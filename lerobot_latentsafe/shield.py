@@ -67,7 +67,7 @@ class Shield:
         model, config = self.filter, self.filter.config
         images, state, fault = self._check_observation(observation, age_s)
         fault, proposed, inputs = self._check_action(proposed, fault, len(state), without)
-        latent = self._filter_history(images, state, fault)
+        latent = self._filter_history(images, state, inputs, fault)
         margin = model.imagination.margin(latent)
         predicted, on_the_way = self._go_on(latent, inputs)
         both = {key: torch.cat([predicted[key], latent[key]]) for key in latent}  # one pass through imagination
@@ -123,7 +123,7 @@ class Shield:
         everyone = torch.ones(batch_size, dtype=torch.bool, device=model.device)
         if proposed is None:
             fault = _first_fault(fault, everyone, without)
-            proposed = model.hold_action(batch_size)
+            proposed = self._hold(batch_size)
         proposed = proposed.to(model.device, torch.float32)
         expected = (batch_size, len(model.config.action_low))
         if tuple(proposed.shape) != expected:
@@ -138,7 +138,7 @@ class Shield:
         fault = _first_fault(fault, out_of_range, Reason.ACTION_OUT_OF_RANGE)
         return fault, proposed, inputs.clamp(-1, 1)
 
-    def _filter_history(self, images: dict[str, Tensor], state: Tensor, fault: Tensor) -> Latent:
+    def _filter_history(self, images: dict[str, Tensor], state: Tensor, inputs: Tensor, fault: Tensor) -> Latent:
         """Posterior of the world model; rows whose observation is unusable go on by imagination alone."""
         world_model = self.filter.world_model
         if self.executed is not None and len(self.executed) != len(state):
@@ -148,10 +148,7 @@ class Shield:
             )
         start = self.latent is None
         latent = world_model.initial(len(state)) if start else self.latent
-        executed = self.executed if not start else torch.zeros(
-            len(state), world_model.action_dim, device=state.device
-        )  # fmt: skip
-        predicted = world_model.step(latent, executed)
+        predicted = world_model.step(latent, self.filter.first_action(inputs) if start else self.executed)
         seen = world_model.correct(predicted, world_model.perceive(images), state)
         blind = (fault >= Reason.OBSERVATION_NOT_FINITE) & (fault <= Reason.OBSERVATION_STALE)
         return replace_rows(seen, predicted, where=blind)
@@ -166,9 +163,15 @@ class Shield:
 
     def _usable(self, action: Tensor, value: Tensor) -> Tensor:
         """The safety policy's action in robot units; where it or its value is not finite, hold."""
-        model = self.filter
         finite = torch.isfinite(action).all(-1) & torch.isfinite(value)
-        return torch.where(finite[:, None], model.denormalise_action(action), model.hold_action(len(action)))
+        return torch.where(finite[:, None], self.filter.denormalise_action(action), self._hold(len(action)))
+
+    def _hold(self, batch_size: int) -> Tensor:
+        """No motion, and the kept commands as they were, in robot units."""
+        model, still = self.filter, self.filter.hold_action(batch_size)
+        if self.executed is None:
+            return still
+        return torch.where(model.kept, model.denormalise_action(self.executed), still)
 
 
 def _first_fault(fault: Tensor, where: Tensor, reason: Reason) -> Tensor:

@@ -9,7 +9,7 @@ import torch
 from lerobot_latentsafe.checkpoint import WEIGHTS, seal
 from lerobot_latentsafe.datasets.clips import ClipReader
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, adopt_dataset
-from lerobot_latentsafe.reachability import LatentImagination, LatentReachability, SafetyCritic, Starts
+from lerobot_latentsafe.reachability import LatentReachability, Starts
 from lerobot_latentsafe.world_models.base import Latent, map_latent, select
 
 
@@ -42,7 +42,8 @@ def encoded_starts(
         z = policy.world_model.encode(clip)
         filtered.append(select({k: v.flatten(0, 1) for k, v in z.items()}, kept))
         percepts = {k: v.flatten(0, 1)[kept] for k, v in clip.percepts.items()}
-        single.append(policy.world_model.observe(None, None, percepts, clip.state.flatten(0, 1)[kept]))
+        before = policy.first_action(clip.action.flatten(0, 1)[kept])
+        single.append(policy.world_model.observe(None, before, percepts, clip.state.flatten(0, 1)[kept]))
     pool: Latent = {k: torch.cat([z[k] for z in (*single, *filtered)]) for k in single[0]}
     size = len(next(iter(pool.values())))
 
@@ -51,6 +52,16 @@ def encoded_starts(
         return map_latent(pool, lambda t: t[picked])
 
     return draw
+
+
+def covered_actions(policy: LatentSafePolicy, reader: ClipReader, coverage: float) -> tuple[list[float], list[float]]:
+    """Range of each command, in [-1, 1], that holds all but a share `coverage` of the data at either end, and zero."""
+    action = policy.normalise_action(torch.from_numpy(np.array(reader.cache.action)).to(policy.device))
+    ends = torch.tensor([coverage, 1 - coverage], device=action.device)
+    low, high = torch.quantile(
+        action[torch.linspace(0, len(action) - 1, min(len(action), 100_000)).long()], ends, dim=0
+    )
+    return low.clamp(-1, 0).tolist(), high.clamp(0, 1).tolist()
 
 
 def train_reachability(
@@ -75,14 +86,12 @@ def train_reachability(
     if steps is not None:
         config.steps = steps
     generator = torch.Generator(device="cpu").manual_seed(seed)
-    imagination = LatentImagination(policy.world_model, policy.margin)
-    candidates = policy.critic.candidates
-    critic = SafetyCritic(
-        policy.world_model.feature_dim, policy.world_model.action_dim, candidates, config, policy.action_varies
-    )
-    policy.critic = critic.to(policy.device)
+    if not policy.critic.discrete:
+        policy.config.fallback_low, policy.config.fallback_high = covered_actions(policy, reader, config.coverage)
+    policy.critic = policy.new_critic(policy.critic.candidates)
     started = time.process_time()
-    learner = LatentReachability(imagination, policy.critic, encoded_starts(policy, reader, generator), config)
+    starts = encoded_starts(policy, reader, generator)
+    learner = LatentReachability(policy.imagination, policy.critic, starts, config)
     progress = trange(config.steps, desc="reachability", unit="step")
     for step in progress:
         metrics = learner.update()

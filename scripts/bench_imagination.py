@@ -90,7 +90,7 @@ def our_learner(policy: LatentSafePolicy, seed: int) -> tuple[LatentReachability
     began = time.process_time()
     starts = encoded_starts(policy, policy.reader, generator)
     seconds = (time.process_time() - began) / len(policy.reader.labels.failure)
-    imagination = LatentImagination(policy.world_model, policy.margin)
+    imagination = policy.imagination
     learner = LatentReachability(imagination, policy.critic, starts, policy.config.reachability, generator)
     return learner, seconds
 

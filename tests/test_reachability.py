@@ -45,6 +45,9 @@ class WindyChain:
     def ended(self, latent):
         return torch.zeros(len(latent["x"]), dtype=torch.bool)
 
+    def complete(self, latent, action):
+        return action
+
 
 CHAIN = ReachabilityConfig(
     critic_hidden=(48, 48), actor_hidden=(32,), steps=900, batch_size=256, pool=8192, horizon=10, refresh=100, lr=3e-3
@@ -195,8 +198,8 @@ def test_look_ahead_keeps_what_is_not_finite():
 
 def test_held_actions_move_only_what_varies():
     config = ReachabilityConfig(critic_hidden=(8,), actor_hidden=(8,))
-    critic = SafetyCritic(4, 3, None, config, torch.tensor([True, False, True]))
-    assert critic.held_actions().tolist() == [[0, 0, 0], [1, 0, 0], [0, 0, 1], [-1, 0, 0], [0, 0, -1]]
+    critic = SafetyCritic(4, 3, None, config, torch.tensor([-0.5, 0, -1]), torch.tensor([1.0, 0, 0.25]))
+    assert critic.held_actions().tolist() == [[0, 0, 0], [1, 0, 0], [0, 0, 0.25], [-0.5, 0, 0], [0, 0, -1]]
 
 
 def test_critic_reads_principal_components_on_one_scale():
@@ -274,7 +277,7 @@ def test_overestimates_weigh_more_than_underestimates():
 
 def test_frozen_commands_are_never_moved():
     config = tiny.reachability_config()
-    critic = SafetyCritic(3, 2, None, config, varies=torch.tensor([True, False]))
+    critic = SafetyCritic(3, 2, None, config, low=torch.tensor([-1.0, 0.0]), high=torch.tensor([1.0, 0.0]))
     action = critic.fallback(torch.randn(40, 3))
     assert action[:, 1].eq(0).all() and action[:, 0].ne(0).any()
 

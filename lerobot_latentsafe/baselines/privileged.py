@@ -39,6 +39,9 @@ class DubinsImagination:
     def ended(self, latent: Latent) -> Tensor:
         return latent["state"][..., :2].abs().amax(-1) > self.half_width
 
+    def complete(self, latent: Latent, action: Tensor) -> Tensor:
+        return action
+
 
 def train_privileged(config: ReachabilityConfig, seed: int, on_step=None) -> tuple[DubinsImagination, SafetyCritic]:
     """Learn the safety value on true states (x, y, heading), uniform starts in the view."""

@@ -87,7 +87,10 @@ class ClipReader:
         window = np.minimum(window, last[:, None])
         percepts, state = self.cache.frames(window)
         percepts = {key: percepts[key].to(policy.device) for key in policy.world_model.percept_names}
-        action = torch.from_numpy(self.cache.action[np.maximum(window - 1, 0)])
+        # Like LeRobot, which clamps to the episode: before its first frame stands the action after it.
+        before = np.maximum(window - 1, 0)
+        before = np.where(self.labels.episode[before] == self.labels.episode[window], before, window)
+        action = torch.from_numpy(self.cache.action[before])
         return self._assemble(window, percepts, state, action, torch.from_numpy(valid), policy)
 
     def _assemble(
@@ -101,7 +104,7 @@ class ClipReader:
         return Clip(
             percepts=percepts,
             state=policy.normalise_state(state.to(device)),
-            action=torch.where(is_first[..., None], 0.0, action),
+            action=torch.where(is_first[..., None], policy.first_action(action), action),
             is_first=is_first,
             valid=valid.to(device),
             failure=torch.from_numpy(self.labels.failure[window]).long().to(device),

@@ -1,6 +1,7 @@
 """The contract between a world model and the rest: encode episodes, step in imagination, be differentiable.
 
 A `Latent` is a batch-first dict of tensors and Markov by construction: everything the model needs to go on is in it.
+Among them is the `action` (B, A) that led to it.
 Within models actions are in [-1, 1] and images in [0, 1]; `action[t]` is the action that *led to* frame t.
 """
 
@@ -127,6 +128,7 @@ class WorldModel(nn.Module, abc.ABC):
         """Posterior after acting and seeing: one tick of the filter. `latent` None starts an episode."""
         if latent is None:
             latent = self.initial(len(state))
+        if action is None:
             action = torch.zeros(len(state), self.action_dim, device=state.device)
         return self.correct(self.step(latent, action), percepts, state)
 

@@ -177,14 +177,14 @@ class RSSM(WorldModel):
 
     def initial(self, batch_size: int) -> Latent:
         h = torch.tanh(self.h0).expand(batch_size, -1)
-        return self._with_prior(h)
+        return {**self._with_prior(h), "action": h.new_zeros(batch_size, self.action_dim)}
 
     def step(self, latent: Latent, action: Tensor) -> Latent:
-        return self._with_prior(self._recur(latent["h"], latent["x"], action))
+        return {**self._with_prior(self._recur(latent["h"], latent["x"], action)), "action": action}
 
     def correct(self, predicted: Latent, percepts: dict[str, Tensor], state: Tensor) -> Latent:
         mean, std = self._posterior(predicted["h"], self.embed(percepts, state))
-        return {"h": predicted["h"], "x": mean, "std": std}
+        return {**predicted, "x": mean, "std": std}
 
     def features(self, latent: Latent) -> Tensor:
         return torch.cat([latent["x"], latent["h"]], -1)
