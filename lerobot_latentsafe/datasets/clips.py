@@ -78,9 +78,9 @@ class ClipReader:
         window = np.minimum(index[:, None] + np.arange(self.length), len(self.labels.failure) - 1)
         return self._assemble(window, percepts, state, action, valid, policy)
 
-    def cut(self, start: np.ndarray, policy: "LatentSafePolicy") -> Clip:
-        """Clips from the frame cache that start at the given frame indices (B,)."""
-        window = start[:, None] + np.arange(self.length)
+    def cut(self, start: np.ndarray, policy: "LatentSafePolicy", length: int | None = None) -> Clip:
+        """Clips from the frame cache that start at the given frame indices (B,); by default of the training length."""
+        window = start[:, None] + np.arange(length or self.length)
         inside = np.minimum(window, len(self.labels.episode) - 1)
         valid = (window == inside) & (self.labels.episode[inside] == self.labels.episode[start][:, None])
         last = start + valid.sum(1) - 1

@@ -119,6 +119,10 @@ class WorldModel(nn.Module, abc.ABC):
         """Whether imagination has left the data because episodes end there: bool (...,)."""
 
     @abc.abstractmethod
+    def error(self, latent: Latent, percepts: dict[str, Tensor], state: Tensor) -> Tensor:
+        """How far a latent is from what was then seen: squared error (B,), in a unit of the model's own."""
+
+    @abc.abstractmethod
     def loss(self, clip: Clip) -> tuple[Tensor, Tensor, dict[str, float]]:
         """Training loss, features (B, T, D) of the posterior for the co-trained margin, and metrics."""
 

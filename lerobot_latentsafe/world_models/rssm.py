@@ -193,6 +193,10 @@ class RSSM(WorldModel):
         over = self.continues(self.features(latent)).squeeze(-1) < 0
         return over & (self.ends_seen > 0)  # a head that never saw an end knows nothing
 
+    def error(self, latent: Latent, percepts: dict[str, Tensor], state: Tensor) -> Tensor:
+        decoded = self.decode(self.features(latent))
+        return sum((decoded[key] - percepts[key]).square().mean((1, 2, 3)) for key in self.image_keys)
+
     def embed(self, images: dict[str, Tensor], state: Tensor) -> Tensor:
         """Observations (N, ...) -> (N, hidden)."""
         parts = [self.encoders[name](self._centred(key, images)) for key, name in self.cameras.items()]

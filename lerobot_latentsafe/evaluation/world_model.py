@@ -1,0 +1,160 @@
+"""What a world model gets right: whether it obeys the action, whether it looks, and whether its margin holds up.
+
+A world model can have a low error and ignore the action, and a filter can score well without looking. So errors are
+given against shuffled actions and against copying the last frame; verdicts on whole imagined episodes against what
+happened; and all of it is meant to be read beside the same numbers of a model that sees no images.
+"""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lerobot_latentsafe.datasets.clips import ClipReader
+from lerobot_latentsafe.datasets.labels import FAILING, SAFE
+from lerobot_latentsafe.evaluation.rollouts import wilson
+from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+from lerobot_latentsafe.world_models.base import Clip, Latent
+
+HORIZONS = (1, 5, 10)
+OBSERVED = 4
+"""Frames seen before imagination starts."""
+
+
+def evaluate_world_model(
+    policy: LatentSafePolicy, reader: ClipReader, episodes: np.ndarray, seed: int = 0, n_windows: int = 1024
+) -> dict:
+    """Every number of `latentsafe eval-world-model`, on held-out episodes.
+
+    Args:
+        reader: of a cached dataset.
+        episodes: their indices; each is also imagined whole, from its first frame.
+        n_windows: random windows within them, for the errors.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    policy.eval()
+    with torch.no_grad():
+        return {
+            "errors": prediction_errors(policy, reader, episodes, n_windows, generator),
+            "margin": margin_quality(policy, reader, episodes, n_windows, generator),
+            "episodes": imagined_episodes(policy, reader, episodes, generator),
+        }
+
+
+def prediction_errors(
+    policy: LatentSafePolicy, reader: ClipReader, episodes: np.ndarray, n: int, generator: torch.Generator
+) -> dict:
+    """Squared errors of imagined percepts at each horizon, and how much worse shuffled actions or copying are."""
+    clip = _windows(policy, reader, episodes, n, OBSERVED + max(HORIZONS), generator)
+    start = _filtered(policy, clip)
+    shuffled = torch.randperm(len(clip.action), generator=generator)
+    errors = {
+        "true": _errors(policy, start, clip, clip.action),
+        "shuffled": _errors(policy, start, clip, clip.action[shuffled]),
+        "copied": _errors(policy, start, clip, None),
+    }
+    return {
+        f"step {h}": {name: float(error[h - 1]) for name, error in errors.items()}
+        | {f"{name} / true": float(errors[name][h - 1] / errors["true"][h - 1]) for name in ("shuffled", "copied")}
+        for h in HORIZONS
+    }
+
+
+def _errors(policy: LatentSafePolicy, latent: Latent, clip: Clip, action: Tensor | None) -> Tensor:
+    """Mean error after each imagined step; without actions, of the last latent seen."""
+    rows = []
+    for t in range(OBSERVED, clip.state.shape[1]):
+        if action is not None:
+            latent = policy.world_model.step(latent, action[:, t])
+        percepts = {key: value[:, t] for key, value in clip.percepts.items()}
+        rows.append(policy.world_model.error(latent, percepts, clip.state[:, t]).mean())
+    return torch.stack(rows)
+
+
+def margin_quality(
+    policy: LatentSafePolicy, reader: ClipReader, episodes: np.ndarray, n: int, generator: torch.Generator
+) -> dict:
+    """Balanced accuracy of l < 0 on latents of frames that were seen, and on latents imagined so many steps ahead."""
+    clip = _windows(policy, reader, episodes, n, OBSERVED + max(HORIZONS), generator)
+    latent = _filtered(policy, clip)
+    margin = lambda: policy.imagination.margin(latent).cpu().numpy()  # noqa: E731
+    failure = clip.failure.cpu().numpy()
+    row = {"seen": balanced_accuracy(margin() < 0, failure[:, OBSERVED - 1])}
+    for h in range(1, max(HORIZONS) + 1):
+        latent = policy.world_model.step(latent, clip.action[:, OBSERVED - 1 + h])
+        if h in HORIZONS:
+            row[f"imagined {h}"] = balanced_accuracy(margin() < 0, failure[:, OBSERVED - 1 + h])
+    return row
+
+
+def imagined_episodes(
+    policy: LatentSafePolicy, reader: ClipReader, episodes: np.ndarray, generator: torch.Generator, horizon: int = 30
+) -> dict:
+    """Imagine the recorded actions of each episode from its first frame alone, and compare with what happened.
+
+    Where episodes branch from one state, only a model that obeys the action can tell which of them fails; where they
+    share one motion, only a model that looks.
+
+    Returns:
+        verdicts: balanced accuracy of "fails within `horizon` steps"; shuffled: the same under other episodes' actions;
+        false_alarms: of the episodes that do not fail; hold_false_alarms: of holding still instead.
+    """
+    first = np.array([np.flatnonzero(reader.labels.episode == e)[0] for e in episodes])
+    clip = reader.cut(first, policy, length=horizon + 1)
+    kept = clip.failure[:, 0] == SAFE
+    failed = ((clip.failure == FAILING) & clip.valid).any(1)[kept].cpu().numpy()
+    percepts = {key: value[kept, 0] for key, value in clip.percepts.items()}
+    start = policy.world_model.observe(None, clip.action[kept, 0], percepts, clip.state[kept, 0])
+    action, valid = clip.action[kept, 1:], clip.valid[kept, 1:]
+    shuffled = torch.randperm(len(action), generator=generator)
+    still = torch.where(policy.kept, clip.action[kept, :1], policy.normalise_action(policy.hold_action(1)))
+    verdict = _fails(policy, start, action, valid)
+    return {
+        "failing": int(failed.sum()),
+        "safe": int((~failed).sum()),
+        "verdicts": balanced_accuracy(verdict, failed),
+        "shuffled": balanced_accuracy(_fails(policy, start, action[shuffled], valid[shuffled]), failed),
+        "false_alarms": wilson(int(verdict[~failed].sum()), int((~failed).sum())),
+        "hold_false_alarms": wilson(
+            int(_fails(policy, start, still.expand_as(action), torch.ones_like(valid)).sum()), len(failed)
+        ),
+    }
+
+
+def _fails(policy: LatentSafePolicy, latent: Latent, action: Tensor, valid: Tensor) -> np.ndarray:
+    """Whether l < 0 at any imagined step."""
+    fails = torch.zeros(len(action), dtype=torch.bool, device=action.device)
+    for t in range(action.shape[1]):
+        latent = policy.world_model.step(latent, action[:, t])
+        fails |= (policy.imagination.margin(latent) < 0) & valid[:, t]
+    return fails.cpu().numpy()
+
+
+def balanced_accuracy(predicted: np.ndarray, truth: np.ndarray) -> float:
+    """Mean of the two classes' accuracies; not a number where a class is absent."""
+    truth = truth.astype(bool)
+    if truth.all() or not truth.any():
+        return float("nan")
+    return float((predicted[truth].mean() + (~predicted[~truth]).mean()) / 2)
+
+
+def _windows(
+    policy: LatentSafePolicy, reader: ClipReader, episodes: np.ndarray, n: int, length: int, generator: torch.Generator
+) -> Clip:
+    """Random windows that lie within an episode."""
+    index = np.flatnonzero(np.isin(reader.labels.episode, episodes))
+    index = index[index + length <= len(reader.labels.episode)]
+    inside = index[reader.labels.episode[index + length - 1] == reader.labels.episode[index]]
+    if not len(inside):
+        raise ValueError(f"no episode has {length} frames, which the errors at {HORIZONS} steps need")
+    picked = torch.randint(len(inside), (n,), generator=generator).numpy()
+    return reader.cut(inside[picked], policy, length=length)
+
+
+def _filtered(policy: LatentSafePolicy, clip: Clip) -> Latent:
+    """The latent after the first OBSERVED frames of each window."""
+    latent = None
+    for t in range(OBSERVED):
+        percepts = {key: value[:, t] for key, value in clip.percepts.items()}
+        latent = policy.world_model.observe(latent, clip.action[:, t], percepts, clip.state[:, t])
+    return latent
+

@@ -1,0 +1,123 @@
+"""A recurrent world model of whole frames: a GRU on the principal components of a frozen encoder's tokens.
+
+z_t = (h_t, v_t, s_t): h_t remembers what was done and seen, v_t are the leading principal components of all the frame's
+tokens, s_t is proprioception. v and s are predicted as changes. A frame is one vector here, not a grid of tokens as in
+DINO-WM, which makes a step of imagination some hundred times cheaper.
+
+Trained open loop: a few frames are observed, the rest of the clip is imagined under the recorded actions. One-step
+losses teach a model to copy the last frame and to ignore the action (see `evaluation/world_model.py`).
+"""
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor, nn
+
+from lerobot_latentsafe.world_models.base import Clip, Latent, WorldModel, WorldModelConfig, replace_rows
+from lerobot_latentsafe.world_models.perception import Perception, PerceptionConfig
+
+
+@WorldModelConfig.register_subclass("gru")
+@dataclass
+class GRUConfig(WorldModelConfig):
+    """Sizes for two cores.
+
+    Attributes:
+        perception: the frozen encoder, and how many principal components of its tokens make a frame's vector.
+        hidden, units: sizes of h and of the layers around it.
+        observed: frames of a clip that are seen before imagination starts, at most.
+        blind: see no images, only proprioception: the control that a model which looks must beat.
+    """
+
+    perception: PerceptionConfig = field(default_factory=PerceptionConfig)
+    image_size: int = 96
+    clip_length: int = 20
+    hidden: int = 256
+    units: int = 256
+    observed: int = 6
+    blind: bool = False
+
+    def build(self, image_keys: list[str], state_dim: int, action_dim: int) -> "FrameGRU":
+        return FrameGRU(self, image_keys, state_dim, action_dim)
+
+
+class FrameGRU(WorldModel):
+    """See the module's text. Latent: hidden (B, H), vector (B, C), state (B, S), action (B, A)."""
+
+    def __init__(self, config: GRUConfig, image_keys: list[str], state_dim: int, action_dim: int):
+        super().__init__()
+        if not image_keys:
+            raise ValueError("a gru world model needs at least one camera, got none; record observation.image* features")
+        self.config, self.image_keys, self.action_dim = config, sorted(image_keys), action_dim
+        self.perception = Perception(config.perception, self.image_keys)
+        n_vector, units = config.perception.components, config.units
+        self.sizes = {"hidden": config.hidden, "vector": n_vector, "state": state_dim, "action": action_dim}
+        self.feature_dim = config.hidden + n_vector + state_dim
+        self.frame_in = nn.Sequential(nn.Linear(n_vector + state_dim, units), nn.SiLU())
+        self.action_in = nn.Sequential(nn.Linear(action_dim, units // 4), nn.SiLU())
+        self.cell = nn.GRUCell(units + units // 4, config.hidden)
+        self.change = nn.Sequential(
+            nn.Linear(config.hidden + n_vector + state_dim, units), nn.SiLU(), nn.Linear(units, n_vector + state_dim)
+        )
+        with torch.no_grad():  # start from the best guess without learning: nothing changes
+            self.change[-1].weight.mul_(0.1)
+            self.change[-1].bias.zero_()
+
+    @property
+    def percept_names(self) -> list[str]:
+        return ["vector"]
+
+    def perceive(self, images: dict[str, Tensor]) -> dict[str, Tensor]:
+        return {"vector": self.perception(images)["vector"]}
+
+    def initial(self, batch_size: int) -> Latent:
+        weight = self.change[-1].weight
+        return {name: weight.new_zeros(batch_size, size) for name, size in self.sizes.items()}
+
+    def step(self, latent: Latent, action: Tensor) -> Latent:
+        frame = torch.cat([latent["vector"], latent["state"]], -1)
+        hidden = self.cell(torch.cat([self.frame_in(frame), self.action_in(action)], -1), latent["hidden"])
+        frame = frame + self.change(torch.cat([hidden, frame], -1))
+        vector, state = frame.split([self.sizes["vector"], self.sizes["state"]], -1)
+        return {"hidden": hidden, "vector": vector, "state": state, "action": action}
+
+    def correct(self, predicted: Latent, percepts: dict[str, Tensor], state: Tensor) -> Latent:
+        vector = torch.zeros_like(percepts["vector"]) if self.config.blind else percepts["vector"]
+        return {**predicted, "vector": vector, "state": state}
+
+    def features(self, latent: Latent) -> Tensor:
+        return torch.cat([latent["hidden"], latent["vector"], latent["state"]], -1)
+
+    def ended(self, latent: Latent) -> Tensor:
+        return torch.zeros(latent["hidden"].shape[:-1], dtype=torch.bool, device=latent["hidden"].device)
+
+    def error(self, latent: Latent, percepts: dict[str, Tensor], state: Tensor) -> Tensor:
+        seen = self.correct(latent, percepts, state)
+        return sum((latent[name] - seen[name]).square().sum(-1) for name in ("vector", "state"))
+
+    def loss(self, clip: Clip) -> tuple[Tensor, Tensor, dict[str, float]]:
+        """Squared errors of all predicted frames, in units of what changes from one frame to the next."""
+        length = clip.state.shape[1]
+        observed = int(torch.randint(1, self.config.observed + 1, ()))
+        seen = {**clip.percepts, "state": clip.state}
+        if self.config.blind:
+            seen["vector"] = torch.zeros_like(seen["vector"])
+        latent = start = self.initial(len(clip.state))
+        predicted, rows = [], []
+        for t in range(length):
+            first = clip.is_first[:, t]
+            latent = self.step(replace_rows(latent, start, where=first), clip.action[:, t])
+            predicted.append(latent)
+            corrected = self.correct(latent, {"vector": seen["vector"][:, t]}, clip.state[:, t])
+            latent = corrected if t < observed else replace_rows(latent, corrected, where=first)
+            rows.append(self.features(latent))
+        counts = (clip.valid & ~clip.is_first)[..., None].float()
+        counts[:, 1:] *= clip.valid[:, :-1, None]
+        losses = {}
+        for name in ("vector", "state"):
+            truth = seen[name]
+            change = torch.diff(truth, dim=1, prepend=truth[:, :1]).square() * counts
+            error = (torch.stack([z[name] for z in predicted], 1) - truth).square() * counts
+            losses[f"loss_{name}"] = error.sum() / change.sum().clamp(min=1e-6)
+        metrics = {name: value.item() for name, value in losses.items()}
+        return sum(losses.values()), torch.stack(rows, 1), metrics
