@@ -7,6 +7,7 @@ import sys
 VERBS: dict[str, tuple[str, str]] = {
     "collect": ("Collect", "record labelled episodes of a simulated task as a LeRobotDataset"),
     "cache": ("Cache", "decode a dataset's frames once, so that training does not have to"),
+    "eval-world-model": ("EvalWorldModel", "ask a world model whether it obeys the action and looks"),
     "train-reachability": (
         "TrainReachability",
         "learn the safety value and the fallback in a world model's imagination",

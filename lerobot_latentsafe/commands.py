@@ -53,7 +53,8 @@ class Collect:
     Sources of the Dubins car: random (the paper's 2,000 trajectories of three actions), random_continuous,
     random_left_only (the ablation), careful and reckless (goal-reaching demonstrations for diffusion policies).
     Sources of the Franka: bag_mix (the paper's 1,300 trajectories), bag_branches (several from each grasped state),
-    bag_strong, bag_weak, blocks_demos, blocks_random. A killed recording of the Franka goes on if started again.
+    bag_lifts (one and the same lift by either end), bag_strong, bag_weak, blocks_demos, blocks_random.
+    A killed recording of the Franka goes on if started again.
     """
 
     source: str
@@ -94,6 +95,58 @@ class Cache:
         cache = build_frame_cache(dataset, self.output_dir, self.image_size)
         print(f"{cache.manifest['n_frames']} frames at {self.image_size} px in {self.output_dir}")
         print(f"train with --dataset.repo_id={self.dataset.repo_id}_cache --dataset.root={self.output_dir}")
+
+
+@dataclass
+class EvalWorldModel:
+    """Ask a trained world model whether it obeys the action, looks, and knows failure in imagination.
+
+    On held-out episodes, cached by `latentsafe cache`: prediction errors against shuffled actions and against copying
+    the last frame; the margin on seen and imagined frames; and whether the model, shown the first frame of an episode,
+    foresees how it ends. On episodes that branch from one state (bag_branches) that takes obeying the action; on
+    episodes that share one motion (bag_lifts) it takes looking. Read it beside a control that is blind.
+    """
+
+    policy: PolicySource
+    dataset: DatasetSource = field(default_factory=DatasetSource)
+    n_episodes: int = 200
+    """Episodes used at most, the last ones of the dataset."""
+    seed: int = 0
+    json: Path | None = None
+
+    def run(self) -> None:
+        import numpy as np
+
+        from lerobot_latentsafe.datasets.clips import ClipReader
+        from lerobot_latentsafe.evaluation.rollouts import provenance, write_json
+        from lerobot_latentsafe.evaluation.world_model import evaluate_world_model
+        from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, adopt_dataset
+
+        policy = LatentSafePolicy.from_pretrained(self.policy.path)
+        policy.require_stage("world_model")
+        meta = self.dataset.metadata()
+        adopt_dataset(policy.config, meta, meta.stats)
+        policy.config.frame_cache = None
+        reader = ClipReader.of_dataset(policy.config, meta)
+        if reader.cache is None:
+            raise ValueError(
+                f"{meta.repo_id} is not cached: run latentsafe cache and give its folder as --dataset.root"
+            )
+        episodes = np.unique(reader.labels.episode)[-self.n_episodes :]
+        row = evaluate_world_model(policy, reader, episodes, self.seed)
+        for part, numbers in row.items():
+            for name, number in numbers.items():
+                print(f"{part:9s} {name:18s} {_short(number)}")
+        if self.json:
+            write_json(self.json, {**row, **provenance(seeds=[self.seed])})
+
+
+def _short(number: float | dict) -> str:
+    if not isinstance(number, dict):
+        return f"{number:.3f}" if isinstance(number, float) else str(number)
+    if "k" in number:
+        return f"{number['k']} of {number['n']}"
+    return "  ".join(f"{name} {value:.3f}" for name, value in number.items())
 
 
 @dataclass

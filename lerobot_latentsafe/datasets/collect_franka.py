@@ -33,12 +33,14 @@ class Source:
         mix: behaviours of `teleoperators/scripted` with the number of episodes of each, in a dataset of full size;
             smaller ones keep the proportions. Episodes of different behaviours are interleaved.
         branches: episodes that start from each grasped state; 0 records whole episodes from the start.
+        grasps: of those states, the shares in which the bag is held by its closed end, middle and open end.
     """
 
     scene: str
     mix: dict[str, int]
     variant: str | None = None
     branches: int = 0
+    grasps: tuple[float, float, float] = (0.6, 0.2, 0.2)
 
     @property
     def n_episodes(self) -> int:
@@ -53,6 +55,7 @@ class Source:
 SOURCES: dict[str, Source] = {
     "bag_mix": Source("bag", {"random": 1000, "open_end": 75, "middle": 75, "closed_end": 100, "side_to_side": 50}),
     "bag_branches": Source("bag", {"branch": 500}, branches=5),
+    "bag_lifts": Source("bag", {"rise": 200}, branches=1, grasps=(0.5, 0.0, 0.5)),
     "bag_strong": Source("bag", {"middle": 100}),
     "bag_weak": Source("bag", {"closed_end": 100}, variant="sealed"),
     "blocks_demos": Source("blocks", {"pluck_careful": 120, "pluck_careless": 80}),
@@ -157,7 +160,7 @@ def episode_frames(robot: "LatentSafeFrankaMujoco", source: Source, episode: int
     robot.reset(_scene_seed(seed, start))
     n_frames = round(info.episode_seconds * info.fps)
     if source.branches:
-        n_frames -= _grasp(robot, _scene_seed(seed, start))
+        n_frames -= _grasp(robot, _scene_seed(seed, start), source.grasps)
     operator = LatentSafeScripted(LatentSafeScriptedConfig(behavior=source.behavior(episode), seed=episode))
     failed = False
     with operator:
@@ -184,13 +187,13 @@ def _scene_seed(seed: int, start: int) -> int:
     return 1_000_000 * seed + start
 
 
-def _grasp(robot: "LatentSafeFrankaMujoco", seed: int) -> int:
-    """Close the fingers on the bag, unrecorded: by its closed end in three of five cases. Returns the steps taken."""
+def _grasp(robot: "LatentSafeFrankaMujoco", seed: int, grasps: tuple[float, float, float]) -> int:
+    """Close the fingers on the bag, unrecorded. Returns the steps taken."""
     from lerobot_latentsafe.envs import bag
     from lerobot_latentsafe.teleoperators.scripted.behaviors import grasp
 
     rng = np.random.default_rng([7, seed])
-    segment = rng.choice([bag.TAIL, bag.MIDDLE, bag.MOUTH], p=[0.6, 0.2, 0.2])
+    segment = rng.choice([bag.TAIL, bag.MIDDLE, bag.MOUTH], p=grasps)
     steps = 0
     for steps, action in enumerate(grasp(robot.scene, int(segment), rng), 1):  # noqa: B007
         robot.send_action(dict(zip(ACTION_NAMES, action.tolist())))

@@ -157,4 +157,3 @@ def _filtered(policy: LatentSafePolicy, clip: Clip) -> Latent:
         percepts = {key: value[:, t] for key, value in clip.percepts.items()}
         latent = policy.world_model.observe(latent, clip.action[:, t], percepts, clip.state[:, t])
     return latent
-

@@ -47,7 +47,9 @@ class FrameGRU(WorldModel):
     def __init__(self, config: GRUConfig, image_keys: list[str], state_dim: int, action_dim: int):
         super().__init__()
         if not image_keys:
-            raise ValueError("a gru world model needs at least one camera, got none; record observation.image* features")
+            raise ValueError(
+                "a gru world model needs at least one camera, got none; record observation.image* features"
+            )
         self.config, self.image_keys, self.action_dim = config, sorted(image_keys), action_dim
         self.perception = Perception(config.perception, self.image_keys)
         n_vector, units = config.perception.components, config.units

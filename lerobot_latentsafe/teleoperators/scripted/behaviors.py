@@ -128,6 +128,11 @@ def branch(scene: bag.BagScene, speed: float, rng: np.random.Generator) -> Actio
         yield from wander(scene, speed, rng)
 
 
+def rise(scene: bag.BagScene, speed: float) -> Actions:
+    """From a grasped bag, the same lift always: what follows differs by where the bag is held alone."""
+    yield from reach(scene, scene.controller.position + up(0.20), speed, CLOSED)
+
+
 # The blocks
 
 
@@ -169,6 +174,7 @@ BAG: dict[str, tuple[Callable[..., Actions], tuple[float, float]]] = {
     "closed_end": (lambda scene, speed, rng: lift(scene, bag.TAIL, speed, rng), (0.15, MAX_SPEED)),
     "side_to_side": (lambda scene, speed, rng: swing(scene, bag.TAIL, speed, rng), (0.08, MAX_SPEED)),
     "branch": (branch, (0.05, MAX_SPEED)),
+    "rise": (lambda scene, speed, rng: rise(scene, speed), (0.25, 0.25)),
     "random": (fumble, (0.2, MAX_SPEED)),
 }
 BLOCKS: dict[str, tuple[Callable[..., Actions], tuple[float, float]]] = {
