@@ -38,7 +38,7 @@ from gymnasium.wrappers import TimeLimit
 from lerobot_latentsafe.datasets.clips import ClipReader
 from lerobot_latentsafe.evaluation.rollouts import provenance, write_json
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
-from lerobot_latentsafe.reachability import LatentImagination, LatentReachability
+from lerobot_latentsafe.reachability import LatentReachability
 from lerobot_latentsafe.training import encoded_starts
 
 ENCODED_FRAMES = 100_000
