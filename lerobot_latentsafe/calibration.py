@@ -42,7 +42,7 @@ def episode_values(policy: LatentSafePolicy, reader: ClipReader, episodes: np.nd
     device, rows = policy.device, []
     for episode in episodes:
         index = np.flatnonzero(reader.labels.episode == episode)
-        percepts, state = reader.cache.frames(index)
+        percepts, state = reader.cache.frames(index, policy.world_model.percept_names)
         state = policy.normalise_state(state.to(device))
         action = policy.normalise_action(torch.from_numpy(reader.cache.action[index]).to(device))
         latent, values = None, []

@@ -80,20 +80,42 @@ class Collect:
 
 @dataclass
 class Cache:
-    """Copy a dataset without its images and store its frames, decoded and resized, beside it."""
+    """Copy a dataset without its images and store what a world model sees of its frames beside it.
+
+    That is each frame, decoded and resized, for an RSSM; with --encoder, the tokens of a frozen encoder and their
+    principal components, for a token world model (gru, dino_wm). A killed build goes on if it is started again;
+    `torchrun --nproc_per_node=N $(which latentsafe) cache ...` shares the work among processes.
+    """
 
     output_dir: Path
     dataset: DatasetSource = field(default_factory=DatasetSource)
-    image_size: int = 32
+    image_size: int | None = None
+    """Pixels; None takes 32, or 96 with an encoder."""
+    encoder: str | None = None
+    """auto, dinov2, dinov2_registers, dinov3, efficientnet_lite0, a folder or a Hub id."""
+    dtype: str = "float16"
+    """How tokens are stored: float16, or int8 with a scale for each token."""
+    basis_from: Path | None = None
+    """Another cache, whose principal components to use: one world model must read all its data by the same."""
 
     def run(self) -> None:
+        from functools import partial
+
         from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-        from lerobot_latentsafe.datasets.frame_cache import build_frame_cache
+        from lerobot_latentsafe.datasets.build_cache import Pictures, Tokens, build_frame_cache
+        from lerobot_latentsafe.world_models.perception import PerceptionConfig
 
         dataset = LeRobotDataset(self.dataset.repo_id, root=self.dataset.root)
-        cache = build_frame_cache(dataset, self.output_dir, self.image_size)
-        print(f"{cache.manifest['n_frames']} frames at {self.image_size} px in {self.output_dir}")
+        recipe, size = Pictures, self.image_size or 32
+        if self.encoder:
+            size = self.image_size or 96
+            config = PerceptionConfig(encoder=self.encoder)
+            recipe = partial(Tokens, config=config, dtype=self.dtype, basis_from=self.basis_from)
+        cache = build_frame_cache(dataset, self.output_dir, size, recipe)
+        if cache is None:
+            return  # another process finishes
+        print(f"{cache.manifest['n_frames']} frames at {size} px in {self.output_dir}")
         print(f"train with --dataset.repo_id={self.dataset.repo_id}_cache --dataset.root={self.output_dir}")
 
 

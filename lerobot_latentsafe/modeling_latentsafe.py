@@ -55,6 +55,8 @@ class LatentSafePolicy(PreTrainedPolicy):
         config.validate_features()
         n_actions = len(config.action_low)
         self.world_model = config.world_model.build(config.cameras, len(config.state_mean), n_actions)
+        if self.reader is not None and self.reader.cache is not None:
+            self.world_model.load_basis(Path(config.frame_cache))
         self.margin = FailureMargin(self.world_model.feature_dim, config.margin_hidden, config.margin_layers)
         for name in ("action_low", "action_high", "state_mean", "state_std"):
             self.register_buffer(name, torch.tensor(getattr(config, name), dtype=torch.float32), persistent=False)

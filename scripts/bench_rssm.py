@@ -41,9 +41,9 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.factory import make_policy
 
 from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
+from lerobot_latentsafe.datasets.build_cache import build_frame_cache
 from lerobot_latentsafe.datasets.clips import ClipReader
 from lerobot_latentsafe.datasets.collect import collect_dubins
-from lerobot_latentsafe.datasets.frame_cache import build_frame_cache
 from lerobot_latentsafe.datasets.labels import FailureLabels
 from lerobot_latentsafe.evaluation.rollouts import provenance, write_json
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
@@ -147,7 +147,7 @@ def authors_frames(reader: ClipReader) -> dict[str, np.ndarray]:
     labels, n = reader.labels, len(reader.labels.episode)
     over = labels.terminal == 1
     return {
-        "image": np.moveaxis(np.asarray(reader.cache.images[CAMERA]), 1, -1),
+        "image": np.moveaxis(np.asarray(reader.cache.percepts[CAMERA]), 1, -1),
         "obs_state": reader.cache.state,
         "action": reader.cache.action[:, :1],
         "is_first": np.append(True, np.diff(labels.episode) != 0),

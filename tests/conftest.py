@@ -47,7 +47,7 @@ def cache_root(dataset_root, tmp_path_factory):
     """The same dataset without images, with its frames at 32 pixels beside it."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    from lerobot_latentsafe.datasets.frame_cache import build_frame_cache
+    from lerobot_latentsafe.datasets.build_cache import build_frame_cache
 
     root = tmp_path_factory.mktemp("data") / "car_cache"
     build_frame_cache(LeRobotDataset(tiny.REPO_ID, root=dataset_root), root, 32)

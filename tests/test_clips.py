@@ -7,8 +7,8 @@ import torch
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from lerobot_latentsafe.datasets.build_cache import build_frame_cache
 from lerobot_latentsafe.datasets.clips import ClipReader
-from lerobot_latentsafe.datasets.frame_cache import build_frame_cache
 from lerobot_latentsafe.datasets.labels import UnlabelledDatasetError
 
 LENGTHS = (11, 9)

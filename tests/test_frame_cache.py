@@ -11,10 +11,10 @@ import torch
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from lerobot_latentsafe.datasets.build_cache import build_frame_cache
 from lerobot_latentsafe.datasets.frame_cache import (
     FrameCache,
     FrameCacheError,
-    build_frame_cache,
     dataset_fingerprint,
     to_model_images,
 )
@@ -149,7 +149,7 @@ def test_manifest_is_written_last(dataset_root, tmp_path, monkeypatch):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("lerobot_latentsafe.datasets.frame_cache.os.replace", interrupted)
+    monkeypatch.setattr("lerobot_latentsafe.datasets.build_cache.os.replace", interrupted)
     with pytest.raises(KeyboardInterrupt):
         build_frame_cache(LeRobotDataset(tiny.REPO_ID, root=dataset_root), tmp_path / "cache", 8)
     assert not (tmp_path / "cache" / "frame_cache" / "manifest.json").exists()

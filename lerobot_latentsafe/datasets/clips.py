@@ -52,6 +52,7 @@ class ClipReader:
                     f"{config.world_model.image_size}; build it with latentsafe cache --image_size="
                     f"{config.world_model.image_size}"
                 )
+            config.world_model.adopt_cache(cache.manifest)
         if config.cameras is None:
             config.cameras = sorted(cameras)
         missing = [key for key in config.cameras if key not in cameras]
@@ -85,8 +86,8 @@ class ClipReader:
         valid = (window == inside) & (self.labels.episode[inside] == self.labels.episode[start][:, None])
         last = start + valid.sum(1) - 1
         window = np.minimum(window, last[:, None])
-        percepts, state = self.cache.frames(window)
-        percepts = {key: percepts[key].to(policy.device) for key in policy.world_model.percept_names}
+        percepts, state = self.cache.frames(window, policy.world_model.percept_names)
+        percepts = {key: value.to(policy.device) for key, value in percepts.items()}
         # Like LeRobot, which clamps to the episode: before its first frame stands the action after it.
         before = np.maximum(window - 1, 0)
         before = np.where(self.labels.episode[before] == self.labels.episode[window], before, window)

@@ -1,14 +1,13 @@
 """Frames decoded once: training reads a memory map instead of decoding images at every step.
 
-`build_frame_cache` writes a copy of the dataset without its images, and beside it, in `frame_cache/`, one array a
-camera at the world model's resolution, keyed by the dataset's frame index. `lerobot-train --dataset.root=<copy>` finds
-it by itself. Windows are cut the same way as LeRobot cuts them, so the losses equal those of decoding.
+A cache lies in `frame_cache/` in a copy of the dataset without its images (see `build_cache.py`): one array for each
+thing that a world model perceives, keyed by the dataset's frame index. That is each camera's picture at the world
+model's resolution, or a frozen encoder's tokens. `lerobot-train --dataset.root=<copy>` finds it by itself. Windows are
+cut the same way as LeRobot cuts them, so the losses equal those of decoding.
 """
 
 import hashlib
 import json
-import os
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,13 +19,12 @@ from torch import Tensor
 
 if TYPE_CHECKING:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-FOLDER, MANIFEST, VERSION = "frame_cache", "manifest.json", 1
+FOLDER, MANIFEST, BASIS, VERSION = "frame_cache", "manifest.json", "basis.safetensors", 2
 
 
 class FrameCacheError(ValueError):
-    """A frame cache that is torn, of another dataset or of another resolution."""
+    """A frame cache that is torn, of another dataset, resolution or encoder."""
 
 
 def to_model_images(images: Tensor, size: int) -> Tensor:
@@ -60,15 +58,17 @@ def dataset_fingerprint(meta: "LeRobotDatasetMetadata") -> str:
 
 @dataclass
 class FrameCache:
-    """Memory-mapped frames of a dataset by frame index.
+    """Memory-mapped percepts of a dataset by frame index.
 
     Attributes:
-        images: camera key -> uint8 (N, 3, S, S).
+        percepts: name -> (N, ...): uint8 pictures, or float16, float32 or int8 numbers.
+        scales: name -> float16 (N, ..., 1), what int8 numbers are multiplied by.
         state: float32 (N, S); action: float32 (N, A) in robot units, taken *after* each frame.
         manifest: what it was made from.
     """
 
-    images: dict[str, np.ndarray]
+    percepts: dict[str, np.ndarray]
+    scales: dict[str, np.ndarray]
     state: np.ndarray
     action: np.ndarray
     manifest: dict
@@ -88,7 +88,8 @@ class FrameCache:
             fingerprint = manifest["fingerprint"]
         except (OSError, json.JSONDecodeError, KeyError, TypeError) as e:
             raise FrameCacheError(
-                f"{folder} has no readable {MANIFEST}; the build was cut off. Delete it and run latentsafe cache again"
+                f"{folder} has no readable {MANIFEST}; the build was cut off. Run the same latentsafe cache again, which "
+                "goes on where it stopped, or delete it"
             ) from e
         if meta is not None and fingerprint != dataset_fingerprint(meta):
             raise FrameCacheError(
@@ -96,72 +97,37 @@ class FrameCache:
                 f"{meta.repo_id} ({dataset_fingerprint(meta)}); run latentsafe cache on this dataset"
             )
         try:
-            images = {k: np.load(folder / f"{k}.npy", mmap_mode="r") for k in manifest["cameras"]}
+            percepts = {k: np.load(folder / f"{k}.npy", mmap_mode="r") for k in manifest["percepts"]}
+            scales = {k: np.load(scale_file(folder, k)) for k, v in percepts.items() if v.dtype == np.int8}
             state, action = np.load(folder / "state.npy"), np.load(folder / "action.npy")
         except (OSError, ValueError, EOFError) as e:
             raise FrameCacheError(f"{folder} is torn ({e}); delete it and run latentsafe cache again") from e
-        lengths = {len(a) for a in (*images.values(), state, action)}
+        lengths = {len(a) for a in (*percepts.values(), *scales.values(), state, action)}
         if lengths != {manifest["n_frames"]}:
             raise FrameCacheError(f"{folder} holds arrays of {sorted(lengths)} frames, not {manifest['n_frames']}")
-        return cls(images, state, action, manifest)
+        return cls(percepts, scales, state, action, manifest)
 
     @property
     def image_size(self) -> int:
         return self.manifest["image_size"]
 
-    def frames(self, index: np.ndarray) -> tuple[dict[str, Tensor], Tensor]:
-        """Images in [0, 1] and proprioception at frame indices of any shape (...)."""
-        images = {key: torch.from_numpy(value[index]).float() / 255.0 for key, value in self.images.items()}
-        return images, torch.from_numpy(self.state[index])
+    def frames(self, index: np.ndarray, names: list[str] | None = None) -> tuple[dict[str, Tensor], Tensor]:
+        """Percepts, pictures in [0, 1], and proprioception at frame indices of any shape (...).
+
+        Args:
+            names: of the percepts; by default all.
+        """
+        return {name: self._read(name, index) for name in names or self.percepts}, torch.from_numpy(self.state[index])
+
+    def _read(self, name: str, index: np.ndarray) -> Tensor:
+        numbers = torch.from_numpy(self.percepts[name][index])
+        if numbers.dtype == torch.uint8:
+            return numbers.float() / 255.0
+        if name in self.scales:
+            return numbers.float() * torch.from_numpy(self.scales[name][index]).float()
+        return numbers.float()
 
 
-def build_frame_cache(dataset: "LeRobotDataset", output_dir: str | Path, image_size: int) -> FrameCache:
-    """Copy a dataset without images and store its frames at `image_size`.
-
-    The manifest is written last and atomically, so a build that was cut off is never taken for a whole one.
-
-    Raises:
-        FileExistsError: output_dir exists.
-    """
-    from lerobot.datasets.dataset_tools import remove_feature
-    from lerobot.utils.constants import ACTION, OBS_STATE
-    from tqdm import trange
-
-    output_dir = Path(output_dir)
-    if output_dir.exists():
-        raise FileExistsError(f"{output_dir} exists; choose another --output_dir or delete it")
-    cameras = list(dataset.meta.camera_keys)
-    if not cameras:
-        raise FrameCacheError(f"{dataset.repo_id} has no camera; its features are {list(dataset.meta.features)}")
-    copy = remove_feature(dataset, cameras, output_dir=output_dir, repo_id=f"{dataset.repo_id}_cache")
-    if (Path(dataset.root) / "labels").exists():
-        shutil.copytree(Path(dataset.root) / "labels", output_dir / "labels")
-    folder = output_dir / FOLDER
-    folder.mkdir()
-    n = dataset.num_frames
-    shape = (n, 3, image_size, image_size)
-    arrays = {
-        key: np.lib.format.open_memmap(folder / f"{key}.npy", mode="w+", dtype=np.uint8, shape=shape) for key in cameras
-    }
-    for i in trange(n, desc="decoding frames", unit="frame"):
-        item = dataset[i]
-        for key, array in arrays.items():
-            array[i] = (to_model_images(item[key], image_size) * 255).round().to(torch.uint8).numpy()
-    for array in arrays.values():
-        array.flush()
-    columns = copy.hf_dataset.with_format("numpy")
-    np.save(folder / "state.npy", np.asarray(columns[OBS_STATE], np.float32).reshape(n, -1))
-    np.save(folder / "action.npy", np.asarray(columns[ACTION], np.float32).reshape(n, -1))
-    manifest = {
-        "version": VERSION,
-        "repo_id": dataset.repo_id,
-        "fingerprint": dataset_fingerprint(dataset.meta),
-        "n_frames": n,
-        "fps": dataset.fps,
-        "image_size": image_size,
-        "cameras": {key: list(dataset.meta.features[key]["shape"]) for key in cameras},
-    }
-    partial = folder / f"{MANIFEST}.partial"
-    partial.write_text(json.dumps(manifest, indent=2))
-    os.replace(partial, folder / MANIFEST)
-    return FrameCache.open(output_dir, copy.meta)
+def scale_file(folder: Path, name: str) -> Path:
+    """Where the scales of an int8 array lie."""
+    return folder / f"{name}.scale.npy"

@@ -8,10 +8,13 @@ Within models actions are in [-1, 1] and images in [0, 1]; `action[t]` is the ac
 import abc
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import draccus
 import torch
 from torch import Tensor, nn
+
+from lerobot_latentsafe.datasets.frame_cache import FrameCacheError
 
 Latent = dict[str, Tensor]
 
@@ -70,6 +73,18 @@ class WorldModelConfig(draccus.ChoiceRegistry, abc.ABC):
     def type(self) -> str:
         return self.get_choice_name(type(self))
 
+    def adopt_cache(self, manifest: dict) -> None:
+        """Check that a frame cache holds what this world model perceives; by default each camera's picture.
+
+        Raises:
+            FrameCacheError: it holds something else.
+        """
+        if "encoder_hash" in manifest:
+            raise FrameCacheError(
+                f"this cache holds the tokens of {manifest['encoder']}, a {self.type} world model reads pictures; build "
+                "one with latentsafe cache --image_size=... and no encoder"
+            )
+
     @abc.abstractmethod
     def build(self, image_keys: list[str], state_dim: int, action_dim: int) -> "WorldModel":
         """The world model with fresh weights."""
@@ -94,6 +109,9 @@ class WorldModel(nn.Module, abc.ABC):
     def percept_names(self) -> list[str]:
         """Keys of what `perceive` returns."""
         return self.image_keys
+
+    def load_basis(self, cache: Path) -> None:
+        """Take over what a frame cache was made with beyond its frames, if anything."""
 
     def perceive(self, images: dict[str, Tensor]) -> dict[str, Tensor]:
         """The part of seeing that is never trained, and that a cache can therefore keep: by default the images.

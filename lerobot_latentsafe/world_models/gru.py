@@ -9,6 +9,7 @@ losses teach a model to copy the last frame and to ignore the action (see `evalu
 """
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
@@ -37,6 +38,9 @@ class GRUConfig(WorldModelConfig):
     observed: int = 6
     blind: bool = False
 
+    def adopt_cache(self, manifest: dict) -> None:
+        self.perception.adopt_cache(manifest)
+
     def build(self, image_keys: list[str], state_dim: int, action_dim: int) -> "FrameGRU":
         return FrameGRU(self, image_keys, state_dim, action_dim)
 
@@ -51,7 +55,7 @@ class FrameGRU(WorldModel):
                 "a gru world model needs at least one camera, got none; record observation.image* features"
             )
         self.config, self.image_keys, self.action_dim = config, sorted(image_keys), action_dim
-        self.perception = Perception(config.perception, self.image_keys)
+        self.perception = Perception(config.perception, self.image_keys, config.image_size)
         n_vector, units = config.perception.components, config.units
         self.sizes = {"hidden": config.hidden, "vector": n_vector, "state": state_dim, "action": action_dim}
         self.feature_dim = config.hidden + n_vector + state_dim
@@ -68,6 +72,9 @@ class FrameGRU(WorldModel):
     @property
     def percept_names(self) -> list[str]:
         return ["vector"]
+
+    def load_basis(self, cache: Path) -> None:
+        self.perception.load_basis(cache)
 
     def perceive(self, images: dict[str, Tensor]) -> dict[str, Tensor]:
         return {"vector": self.perception(images)["vector"]}

@@ -1,0 +1,278 @@
+"""Making a frame cache: a copy of the dataset without its images, and beside it what a world model perceives.
+
+A build that was killed goes on where it stopped if it is started again, and several processes (`torchrun`) share the
+episodes among them. The manifest is written last and atomically, so what is unfinished is never taken for a whole.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lerobot_latentsafe.datasets.frame_cache import (
+    BASIS,
+    FOLDER,
+    MANIFEST,
+    VERSION,
+    FrameCache,
+    FrameCacheError,
+    dataset_fingerprint,
+    to_model_images,
+)
+
+if TYPE_CHECKING:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from lerobot_latentsafe.labeling.frames import DatasetFrames
+    from lerobot_latentsafe.world_models.perception import PerceptionConfig
+
+LAYOUT, DONE = "layout.json", "done.npy"
+ENCODED_AT_ONCE = 8
+"""Frames an encoder reads together: few enough for its activations to stay in a CPU's cache."""
+SAMPLED_EPISODES, SAMPLED_FRAMES = 100, 4000
+"""From which principal components are found."""
+
+See = Callable[[int], dict[str, Tensor]]
+"""All frames of an episode as a world model takes them: camera key -> (T, 3, S, S) in [0, 1]."""
+
+
+class Recipe(Protocol):
+    """What is kept of a frame: arrays by name with a frame's shape and type, and what to note of them."""
+
+    arrays: dict[str, tuple[tuple[int, ...], str]]
+    manifest: dict
+
+    def prepare(self, folder: Path, see: See, n_episodes: int) -> None:
+        """What one process must do before any can start."""
+
+    def start(self, folder: Path) -> None:
+        """What each process does then."""
+
+    def perceive(self, images: dict[str, Tensor]) -> dict[str, np.ndarray]:
+        """Camera key -> (T, 3, S, S) in [0, 1] to name -> (T, ...)."""
+
+
+class Pictures:
+    """Each camera's picture, in 8 bits."""
+
+    def __init__(self, cameras: list[str], image_size: int):
+        self.arrays = {key: ((3, image_size, image_size), "uint8") for key in cameras}
+        self.manifest = {"image_size": image_size, "percepts": list(cameras)}
+
+    def prepare(self, folder: Path, see: See, n_episodes: int) -> None:
+        pass
+
+    def start(self, folder: Path) -> None:
+        pass
+
+    def perceive(self, images: dict[str, Tensor]) -> dict[str, np.ndarray]:
+        return {key: (value * 255).round().to(torch.uint8).numpy() for key, value in images.items()}
+
+
+class Tokens:
+    """A frozen encoder's tokens, and the principal components of a frame's.
+
+    Args:
+        dtype: of the tokens: float16, or int8 with a scale for each token.
+        basis_from: a folder with a cache whose principal components to use, so that one world model reads both.
+    """
+
+    def __init__(
+        self, cameras: list[str], image_size: int, config: "PerceptionConfig", dtype: str = "float16",
+        basis_from: str | Path | None = None,
+    ):  # fmt: skip
+        from lerobot_latentsafe.world_models.perception import Perception
+
+        if dtype not in ("float16", "int8"):
+            raise ValueError(f"--dtype is {dtype!r}; expected float16 or int8")
+        self.perception, self.dtype, self.basis_from = Perception(config, cameras, image_size), dtype, basis_from
+        n_patches = self.perception.n_patches
+        self.arrays = {
+            "tokens": ((n_patches, self.perception.token_dim), dtype),
+            "vector": ((config.components,), "float32"),
+        }
+        if dtype == "int8":
+            self.arrays["tokens.scale"] = ((n_patches, 1), "float16")
+        self.manifest = {
+            "image_size": image_size,
+            "percepts": ["tokens", "vector"],
+            "encoder": config.encoder,
+            "encoder_hash": config.encoder_hash,
+        }
+
+    def prepare(self, folder: Path, see: See, n_episodes: int) -> None:
+        """Take the principal components from elsewhere, or find them in a sample of frames."""
+        from safetensors.torch import save_file
+
+        if self.basis_from is not None:
+            other = FrameCache.open(self.basis_from)
+            if other.manifest.get("encoder_hash") != self.manifest["encoder_hash"]:
+                raise FrameCacheError(
+                    f"the cache in {self.basis_from} was made by {other.manifest.get('encoder')}, not by "
+                    f"{self.manifest['encoder']} with the same weights; their principal components do not fit"
+                )
+            shutil.copyfile(Path(self.basis_from) / FOLDER / BASIS, folder / BASIS)
+            return
+        rng = np.random.default_rng(0)
+        episodes = rng.permutation(n_episodes)[:SAMPLED_EPISODES]
+        tokens = []
+        for episode in episodes:
+            images = see(int(episode))
+            n = len(next(iter(images.values())))
+            picked = rng.permutation(n)[: -(-SAMPLED_FRAMES // len(episodes))]
+            tokens.append(self._tokens({key: value[picked] for key, value in images.items()}))
+        torch.manual_seed(0)
+        self.perception.basis.fit(torch.cat(tokens))
+        save_file(self.perception.basis.state_dict(), folder / BASIS)
+
+    def start(self, folder: Path) -> None:
+        from safetensors.torch import load_file
+
+        self.perception.basis.load_state_dict(load_file(folder / BASIS))
+        self.manifest["basis_hash"] = hashlib.sha256((folder / BASIS).read_bytes()).hexdigest()[:16]
+
+    def perceive(self, images: dict[str, Tensor]) -> dict[str, np.ndarray]:
+        tokens = self._tokens(images)
+        vector = self.perception.basis(tokens).numpy()
+        if self.dtype == "float16":
+            return {"tokens": tokens.half().numpy(), "vector": vector}
+        scale = (tokens.abs().amax(-1, keepdim=True) / 127).clamp(min=1e-6).half()
+        rounded = (tokens / scale.float()).round().clamp(-127, 127).to(torch.int8)
+        return {"tokens": rounded.numpy(), "tokens.scale": scale.numpy(), "vector": vector}
+
+    def _tokens(self, images: dict[str, Tensor]) -> Tensor:
+        n = len(next(iter(images.values())))
+        parts = range(0, n, ENCODED_AT_ONCE)
+        return torch.cat(
+            [self.perception.tokens({k: v[at : at + ENCODED_AT_ONCE] for k, v in images.items()}) for at in parts]
+        )
+
+
+def build_frame_cache(
+    dataset: "LeRobotDataset", output_dir: str | Path, image_size: int,
+    recipe: Callable[[list[str], int], Recipe] = Pictures,
+) -> FrameCache | None:  # fmt: skip
+    """Make a cache, or go on making it.
+
+    Args:
+        recipe: from cameras and image size: `Pictures`, or `Tokens` with its encoder.
+
+    Returns:
+        The cache; None in a process that was not the last to finish.
+
+    Raises:
+        FileExistsError: output_dir holds something else, a finished cache, or an unfinished one of something else.
+        FrameCacheError: the dataset has no camera.
+    """
+    from tqdm import tqdm
+
+    from lerobot_latentsafe.labeling.frames import DatasetFrames
+
+    output_dir, folder = Path(output_dir), Path(output_dir) / FOLDER
+    if not dataset.meta.camera_keys:
+        raise FrameCacheError(f"{dataset.repo_id} has no camera; its features are {list(dataset.meta.features)}")
+    if output_dir.exists() and ((folder / MANIFEST).exists() or not folder.exists()):
+        raise FileExistsError(f"{output_dir} exists; choose another --output_dir or delete it")
+    frames = DatasetFrames(dataset.meta)
+    see = lambda episode: _episode_images(frames, episode, image_size)  # noqa: E731
+    kept = recipe(frames.cameras, image_size)
+    rank, world = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
+    if rank == 0:
+        _lay_out(dataset, output_dir, kept, see)
+    _await_layout(dataset, folder, kept)
+    kept.start(folder)
+    arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r+") for name in kept.arrays}
+    done = np.load(folder / DONE, mmap_mode="r+")
+    mine = [e for e in range(rank, dataset.num_episodes, world) if not done[e]]
+    for episode in tqdm(mine, desc="decoding episodes", unit="episode", disable=rank > 0):
+        first = dataset.meta.episodes[episode]["dataset_from_index"]
+        for name, values in kept.perceive(see(episode)).items():
+            arrays[name][first : first + len(values)] = values
+            arrays[name].flush()
+        done[episode] = True
+        done.flush()
+    return _finish(dataset, output_dir, kept) if done.all() else None
+
+
+def _episode_images(frames: "DatasetFrames", episode: int, image_size: int) -> dict[str, Tensor]:
+    images = {}
+    for key in frames.cameras:
+        stored = torch.from_numpy(frames.images(key, episode)).permute(0, 3, 1, 2)
+        images[key] = torch.cat([to_model_images(part, image_size) for part in stored.split(32)])
+    return images
+
+
+def _layout(dataset: "LeRobotDataset", kept: Recipe) -> dict:
+    """Tells whether an unfinished cache is of the same thing."""
+    return json.loads(json.dumps([dataset_fingerprint(dataset.meta), kept.arrays, kept.manifest]))
+
+
+def _lay_out(dataset: "LeRobotDataset", output_dir: Path, kept: Recipe, see: See) -> None:
+    """Copy the dataset without images and make room for all frames, unless that was done before."""
+    from lerobot.datasets.dataset_tools import remove_feature
+    from lerobot.utils.constants import ACTION, OBS_STATE
+
+    folder, n = output_dir / FOLDER, dataset.num_frames
+    if (folder / LAYOUT).exists():
+        return
+    shutil.rmtree(output_dir, ignore_errors=True)  # at most an earlier beginning of this function
+    cameras = list(dataset.meta.camera_keys)
+    copy = remove_feature(dataset, cameras, output_dir=output_dir, repo_id=f"{dataset.repo_id}_cache")
+    if (Path(dataset.root) / "labels").exists():
+        shutil.copytree(Path(dataset.root) / "labels", output_dir / "labels")
+    folder.mkdir()
+    columns = copy.hf_dataset.with_format("numpy")
+    np.save(folder / "state.npy", np.asarray(columns[OBS_STATE], np.float32).reshape(n, -1))
+    np.save(folder / "action.npy", np.asarray(columns[ACTION], np.float32).reshape(n, -1))
+    for name, (shape, dtype) in kept.arrays.items():
+        np.lib.format.open_memmap(folder / f"{name}.npy", mode="w+", dtype=dtype, shape=(n, *shape))
+    np.save(folder / DONE, np.zeros(dataset.num_episodes, bool))
+    kept.prepare(folder, see, dataset.num_episodes)
+    _write(folder / LAYOUT, _layout(dataset, kept))
+
+
+def _await_layout(dataset: "LeRobotDataset", folder: Path, kept: Recipe, patience_s: float = 600) -> None:
+    """Wait until the first process has laid the cache out, and check that it is this one."""
+    given_up = time.monotonic() + patience_s
+    while not (folder / LAYOUT).exists():
+        if time.monotonic() > given_up:
+            raise FrameCacheError(f"{folder} was not laid out within {patience_s:.0f} s; did the first process stop?")
+        time.sleep(0.1)
+    if json.loads((folder / LAYOUT).read_text()) != _layout(dataset, kept):
+        raise FileExistsError(
+            f"{folder} holds an unfinished cache of another dataset, size or encoder; choose another --output_dir or "
+            "delete it"
+        )
+
+
+def _finish(dataset: "LeRobotDataset", output_dir: Path, kept: Recipe) -> FrameCache:
+    """Write the manifest, which makes it a cache."""
+    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+
+    meta = dataset.meta
+    manifest = {
+        "version": VERSION,
+        "repo_id": dataset.repo_id,
+        "fingerprint": dataset_fingerprint(meta),
+        "n_frames": dataset.num_frames,
+        "fps": dataset.fps,
+        "cameras": {key: list(meta.features[key]["shape"]) for key in meta.camera_keys},
+        **kept.manifest,
+    }
+    _write(output_dir / FOLDER / MANIFEST, manifest)
+    return FrameCache.open(output_dir, LeRobotDatasetMetadata(f"{dataset.repo_id}_cache", root=output_dir))
+
+
+def _write(file: Path, content: object) -> None:
+    """Atomically."""
+    partial = file.with_name(f"{file.name}.partial")
+    partial.write_text(json.dumps(content, indent=2))
+    os.replace(partial, file)

