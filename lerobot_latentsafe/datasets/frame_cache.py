@@ -88,8 +88,8 @@ class FrameCache:
             fingerprint = manifest["fingerprint"]
         except (OSError, json.JSONDecodeError, KeyError, TypeError) as e:
             raise FrameCacheError(
-                f"{folder} has no readable {MANIFEST}; the build was cut off. Run the same latentsafe cache again, which "
-                "goes on where it stopped, or delete it"
+                f"{folder} has no readable {MANIFEST}; the build was cut off. Run the same latentsafe cache "
+                "again, which goes on where it stopped, or delete it"
             ) from e
         if meta is not None and fingerprint != dataset_fingerprint(meta):
             raise FrameCacheError(

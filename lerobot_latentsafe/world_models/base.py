@@ -81,8 +81,8 @@ class WorldModelConfig(draccus.ChoiceRegistry, abc.ABC):
         """
         if "encoder_hash" in manifest:
             raise FrameCacheError(
-                f"this cache holds the tokens of {manifest['encoder']}, a {self.type} world model reads pictures; build "
-                "one with latentsafe cache --image_size=... and no encoder"
+                f"this cache holds the tokens of {manifest['encoder']}, a {self.type} world model reads pictures; "
+                "build one with latentsafe cache --image_size=... and no encoder"
             )
 
     @abc.abstractmethod

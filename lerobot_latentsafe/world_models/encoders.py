@@ -1,8 +1,8 @@
 """Frozen, pretrained patch encoders: images to a grid of tokens.
 
-`auto` takes DINOv2 if it is in the Hub's cache or a Hub answers, else the ImageNet-pretrained trunk of EfficientNet-Lite0
-that comes as a package, and says so. Random weights are never an option: features that mean nothing still have a low
-prediction error. Which encoder it was, and a hash of its weights, is kept with whatever was made from its tokens.
+`auto` takes DINOv2 if it is in the Hub's cache or a Hub answers, else the ImageNet-pretrained trunk of
+EfficientNet-Lite0 that comes as a package, and says so. Random weights are never an option: features that mean nothing
+still have a low prediction error. Which encoder it was, and a hash of its weights, is kept with whatever was made from its tokens.
 """
 
 import hashlib
@@ -56,8 +56,8 @@ class PatchEncoder(nn.Module):
         size = images.shape[-1]
         if images.shape[-2] != size or size % self.patch:
             raise ValueError(
-                f"{self.name} reads square images of a multiple of {self.patch} pixels, got {tuple(images.shape[-2:])}; "
-                "choose another image_size"
+                f"{self.name} reads square images of a multiple of {self.patch} pixels, got "
+                f"{tuple(images.shape[-2:])}; choose another image_size"
             )
         return self.tokens((images - self.mean) / self.std)
 
@@ -188,8 +188,8 @@ def load_encoder(name: str, expected_hash: str | None = None) -> PatchEncoder:
     encoder = encoder.requires_grad_(False).eval()
     if expected_hash is not None and encoder.weights_hash() != expected_hash:
         raise EncoderError(
-            f"encoder {name} has weights {encoder.weights_hash()}, {expected_hash} were trained with: tokens would mean "
-            "something else. Restore that encoder, or encode and train anew"
+            f"encoder {name} has weights {encoder.weights_hash()}, {expected_hash} were trained with: tokens would "
+            "mean something else. Restore that encoder, or encode and train anew"
         )
     return encoder
 

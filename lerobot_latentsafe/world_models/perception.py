@@ -104,7 +104,7 @@ class Perception(nn.Module):
         return self._encoder[0]
 
     def tokens(self, images: dict[str, Tensor]) -> Tensor:
-        """Camera key -> (B, 3, S, S) in [0, 1] to tokens (B, P, n_cameras x dim): a patch of each camera side by side."""
+        """Camera key -> (B, 3, S, S) in [0, 1] to tokens (B, P, n_cameras x dim), a patch of each side by side."""
         together = torch.cat([images[key] for key in self.image_keys])
         self._encoder[0] = self.encoder.to(together.device)
         tokens = self.encoder(together).float()
