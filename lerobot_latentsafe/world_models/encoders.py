@@ -2,7 +2,8 @@
 
 `auto` takes DINOv2 if it is in the Hub's cache or a Hub answers, else the ImageNet-pretrained trunk of
 EfficientNet-Lite0 that comes as a package, and says so. Random weights are never an option: features that mean nothing
-still have a low prediction error. Which encoder it was, and a hash of its weights, is kept with whatever was made from its tokens.
+still have a low prediction error. Which encoder it was, and a hash of its weights, is kept
+with whatever was made from its tokens.
 """
 
 import hashlib
