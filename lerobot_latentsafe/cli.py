@@ -8,6 +8,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "collect": ("Collect", "record labelled episodes of a simulated task as a LeRobotDataset"),
     "cache": ("Cache", "decode a dataset's frames once, so that training does not have to"),
     "eval-world-model": ("EvalWorldModel", "ask a world model whether it obeys the action and looks"),
+    "train-margin": ("TrainMargin", "fit the failure margin to labels on a frozen world model"),
     "train-reachability": (
         "TrainReachability",
         "learn the safety value and the fallback in a world model's imagination",

@@ -172,6 +172,26 @@ def _short(number: float | dict) -> str:
 
 
 @dataclass
+class TrainMargin:
+    """Fit the failure margin to the labels on a trained, frozen world model.
+
+    For world models trained with --policy.margin_weight=0, and whenever labels change or another failure is meant: the
+    world model stays. Run train-reachability afterwards.
+    """
+
+    policy: PolicySource
+    output_dir: Path
+    dataset: DatasetSource = field(default_factory=DatasetSource)
+    seed: int = 0
+
+    def run(self) -> None:
+        from lerobot_latentsafe.training import train_margin
+
+        train_margin(self.policy.path, self.dataset.metadata(), self.output_dir, self.seed)
+        print(f"world model with a new margin in {self.output_dir}")
+
+
+@dataclass
 class TrainReachability:
     """Learn V and the fallback policy in the imagination of a trained, frozen world model.
 

@@ -22,7 +22,8 @@ class LatentSafeConfig(PreTrainedConfig):
         world_model: its type and sizes.
         margin_hidden, margin_layers: the failure margin's MLP (Eq. 3; 2 layers of 16 in the paper).
         margin_delta: delta of Eq. 3.
-        margin_weight: weight of Eq. 3 in the training loss.
+        margin_weight: weight of Eq. 3 in the training loss; 0 leaves the margin to `latentsafe train-margin`.
+        margin_clips: windows of the data that `latentsafe train-margin` fits the margin to.
         failure_specification: name of the failure labels: a dataset column or a sidecar file.
         frame_cache: folder made by `latentsafe cache`; by default the one in the dataset's folder, if there is one.
         reachability: actor-critic sizes and schedule.
@@ -52,6 +53,7 @@ class LatentSafeConfig(PreTrainedConfig):
     margin_layers: int = 2
     margin_delta: float = 0.75
     margin_weight: float = 10.0
+    margin_clips: int = 10_000
     failure_specification: str = "failure"
     frame_cache: str | None = None
 

@@ -1,16 +1,108 @@
-"""Training of the second stage: reachability in a frozen world model's imagination."""
+"""Training on top of a frozen world model: the failure margin by itself, and reachability in imagination."""
 
 import time
 from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from lerobot_latentsafe.checkpoint import WEIGHTS, seal
 from lerobot_latentsafe.datasets.clips import ClipReader
+from lerobot_latentsafe.margin import FailureMargin, hinge_loss
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, adopt_dataset
 from lerobot_latentsafe.reachability import LatentReachability, Starts
 from lerobot_latentsafe.world_models.base import Latent, map_latent, select
+
+
+@torch.no_grad()
+def seen_and_imagined(
+    policy: LatentSafePolicy, reader: ClipReader, n_clips: int, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Features (N, D) and labels (N,) of random windows: a few frames are seen, the rest imagined as they were acted.
+
+    A margin that has seen real latents alone is a stranger to imagined ones, and those are what a filter asks about.
+    """
+    world_model, rows = policy.world_model, []
+    for _ in range(-(-n_clips // 64)):
+        clip = reader.cut(torch.randint(len(reader.labels.failure), (64,), generator=generator).numpy(), policy)
+        observed = int(torch.randint(1, clip.state.shape[1] + 1, (), generator=generator))
+        latent = None
+        for t in range(clip.state.shape[1]):
+            if t < observed:
+                percepts = {key: value[:, t] for key, value in clip.percepts.items()}
+                latent = world_model.observe(latent, clip.action[:, t], percepts, clip.state[:, t])
+            else:
+                latent = world_model.step(latent, clip.action[:, t])
+            kept = clip.valid[:, t] & (clip.failure[:, t] >= 0)
+            rows.append((world_model.features(latent)[kept], clip.failure[kept, t]))
+    features, failure = (torch.cat(column) for column in zip(*rows))
+    return features, failure
+
+
+def fit_margin(
+    margin: FailureMargin, features: Tensor, failure: Tensor, delta: float, generator: torch.Generator,
+    steps: int = 1500, noise: float = 0.5,
+) -> None:  # fmt: skip
+    """Fit a margin (Eq. 3) to fixed features, regularised: trained along with a world model it overfits.
+
+    Args:
+        noise: standard deviation of Gaussian noise on the features, which are scaled to unit deviation meanwhile.
+    """
+    mean, std = features.mean(0), features.std(0).clamp(min=1e-3)
+    first = margin.net[0]
+    optimizer = torch.optim.AdamW(margin.parameters(), 1e-3, weight_decay=0.3)
+    for step in range(steps):
+        for group in optimizer.param_groups:
+            group["lr"] = 1e-3 * min(1.0, 2 - 2 * step / steps)
+        picked = torch.randint(len(features), (512,), generator=generator, device="cpu").to(features.device)
+        x = (features[picked] - mean) / std
+        x = x + noise * torch.randn(x.shape, generator=generator).to(x.device)
+        loss = hinge_loss(margin(x), failure[picked], delta)
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        optimizer.step()
+    with torch.no_grad():  # the margin reads features as they are
+        first.weight.div_(std)
+        first.bias.sub_(first.weight @ mean)
+
+
+def train_margin(path: str | Path, dataset_meta, output_dir: Path, seed: int = 0) -> LatentSafePolicy:
+    """Load a world model, fit a fresh failure margin to its frozen features, save both.
+
+    The critic of another margin says nothing about this one: the stage goes back to `world_model`.
+
+    Raises:
+        UntrainedFilterError: the world model was never trained.
+        FileExistsError: output_dir holds a checkpoint already.
+    """
+    policy, reader = _load_frozen(path, dataset_meta, output_dir, seed)
+    generator = torch.Generator().manual_seed(seed)
+    config, started = policy.config, time.process_time()
+    features, failure = seen_and_imagined(policy, reader, config.margin_clips, generator)
+    policy.margin = FailureMargin(features.shape[1], config.margin_hidden, config.margin_layers).to(policy.device)
+    fit_margin(policy.margin, features, failure, config.margin_delta, generator)
+    config.stage, config.frame_cache = "world_model", None
+    save_filter(policy, output_dir)
+    print(f"margin: {time.process_time() - started:.0f} CPU-s")
+    return policy
+
+
+def _load_frozen(path: str | Path, dataset_meta, output_dir: Path, seed: int) -> tuple[LatentSafePolicy, ClipReader]:
+    """A trained world model and the reader of a cached dataset, after every check that costs nothing."""
+    refuse_existing(output_dir)
+    torch.manual_seed(seed)
+    policy = LatentSafePolicy.from_pretrained(path)
+    policy.require_stage("world_model")
+    adopt_dataset(policy.config, dataset_meta, dataset_meta.stats)
+    policy.config.frame_cache = None  # that of the first stage may be gone; the dataset brings its own
+    reader = ClipReader.of_dataset(policy.config, dataset_meta)
+    if reader.cache is None:
+        raise ValueError(
+            "training on a frozen world model reads cached frames: run latentsafe cache on the dataset and give its "
+            "folder as --dataset.root"
+        )
+    return policy, reader
 
 
 @torch.no_grad()
@@ -26,11 +118,6 @@ def encoded_starts(
     Returns:
         A sampler of latents.
     """
-    if reader.cache is None:
-        raise ValueError(
-            "reachability starts from encoded frames: run latentsafe cache on the dataset and give its folder "
-            "as --dataset.root"
-        )
     n, length = len(reader.labels.failure), policy.config.world_model.clip_length
     offset = int(torch.randint(length, (1,), generator=generator))
     first = np.arange(offset, n, length)
@@ -75,13 +162,7 @@ def train_reachability(
     """
     from tqdm import trange
 
-    refuse_existing(output_dir)
-    torch.manual_seed(seed)
-    policy = LatentSafePolicy.from_pretrained(path)
-    policy.require_stage("world_model")
-    adopt_dataset(policy.config, dataset_meta, dataset_meta.stats)
-    policy.config.frame_cache = None  # that of the first stage may be gone; the dataset brings its own
-    reader = ClipReader.of_dataset(policy.config, dataset_meta)
+    policy, reader = _load_frozen(path, dataset_meta, output_dir, seed)
     config = policy.config.reachability
     if steps is not None:
         config.steps = steps
