@@ -6,6 +6,7 @@ registries, and loads nothing heavy: models and simulators are imported when the
 
 from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
 from lerobot_latentsafe.envs.configuration_envs import LatentSafeBagEnv, LatentSafeBlocksEnv, LatentSafeDubinsEnv
+from lerobot_latentsafe.perceive import PerceiveStep
 from lerobot_latentsafe.robots.franka.config_franka import LatentSafeFrankaConfig
 from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
 from lerobot_latentsafe.teleoperators.end_effector.config_end_effector import LatentSafeEndEffectorConfig
@@ -20,5 +21,6 @@ __all__ = [
     "LatentSafeFrankaConfig",
     "LatentSafeFrankaMujocoConfig",
     "LatentSafeScriptedConfig",
+    "PerceiveStep",
 ]
 __version__ = "0.1.0"
