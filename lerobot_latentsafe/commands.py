@@ -262,6 +262,7 @@ class Wrap:
     base_policy_path: str | None = None
     epsilon: float | None = None
     guard: int | None = None
+    law: str | None = None
     mode: str | None = None
     half: bool = False
     """Store weights in 16 bits."""
@@ -272,7 +273,7 @@ class Wrap:
 
         refuse_existing(self.output_dir)
         policy = LatentSafePolicy.from_pretrained(self.policy.path)
-        for name in ("epsilon", "guard", "mode"):
+        for name in ("epsilon", "guard", "law", "mode"):
             if getattr(self, name) is not None:
                 setattr(policy.config, name, getattr(self, name))
         policy.config.__post_init__()
@@ -363,7 +364,8 @@ class EvalShield:
     seed: int = 0
     epsilon: float | None = None
     guard: int | None = None
-    """Both override the filter's."""
+    law: str | None = None
+    """These override the filter's."""
     json: Path | None = None
     video: Path | None = None
     """Folder for videos of the first episodes, bare and shielded side by side."""
@@ -379,7 +381,7 @@ class EvalShield:
         if self.n_episodes < 1:
             raise ValueError(f"--n_episodes is {self.n_episodes}; expected at least 1")
         policy = LatentSafePolicy.from_pretrained(self.policy.path)
-        for name in ("epsilon", "guard"):
+        for name in ("epsilon", "guard", "law"):
             if getattr(self, name) is not None:
                 setattr(policy.config, name, getattr(self, name))
         policy.config.__post_init__()
@@ -391,6 +393,7 @@ class EvalShield:
             **result,
             "epsilon": policy.config.epsilon,
             "guard": policy.config.guard,
+            "law": policy.config.law,
             **provenance(seeds=[self.seed]),
         }
         for name in ("bare", "shielded"):

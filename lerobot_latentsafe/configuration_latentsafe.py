@@ -11,6 +11,7 @@ from lerobot_latentsafe.world_models import RSSMConfig, WorldModelConfig
 
 STAGES = ("untrained", "world_model", "reachability")
 MODES = ("filter", "monitor")
+LAWS = ("reachability", "plan", "margin")
 
 
 @PreTrainedConfig.register_subclass("latentsafe")
@@ -36,6 +37,8 @@ class LatentSafeConfig(PreTrainedConfig):
         calibration: the evidence epsilon was chosen on; written by `latentsafe calibrate`.
         lookahead: steps of imagination before the critic's value is read, 0 to 25: V and the fallback are the best of
             the critic's policy and of holding each action. 0 is the critic alone, and the cheapest.
+        law: what V is: `reachability`; or a baseline that learns no value: `plan` imagines holding each action, and
+            `margin` reads l alone and stands still.
         mode: `filter` overrides unsafe actions, `monitor` only reports what it would have done.
         deadline_ms: if set, a decision that took longer is not trusted, and the fallback acts.
         base_policy_path: the policy to shield: a folder, a Hub id or the name of a committed checkpoint.
@@ -68,6 +71,7 @@ class LatentSafeConfig(PreTrainedConfig):
     guard: int = 1
     calibration: dict[str, float] = field(default_factory=dict)
     lookahead: int = 15
+    law: str = "reachability"
     mode: str = "filter"
     deadline_ms: float | None = None
     base_policy_path: str | None = None
@@ -103,6 +107,8 @@ class LatentSafeConfig(PreTrainedConfig):
             raise ValueError(f"stage is {self.stage!r}; expected one of {', '.join(STAGES)}")
         if self.mode not in MODES:
             raise ValueError(f"--policy.mode is {self.mode!r}; expected one of {', '.join(MODES)}")
+        if self.law not in LAWS:
+            raise ValueError(f"--policy.law is {self.law!r}; expected one of {', '.join(LAWS)}")
         if not 0 <= self.lookahead <= 25:
             raise ValueError(f"--policy.lookahead is {self.lookahead}; expected 0 (critic alone) to 25 imagined steps")
         if not 1 <= self.guard <= 25:

@@ -144,11 +144,21 @@ class LatentSafePolicy(PreTrainedPolicy):
     def plan(self, latent: Latent) -> tuple[Tensor, Tensor]:
         """The safety value V(z), and the fallback action in [-1, 1]: (B,), (B, A).
 
-        min(l, max_a Q) of the critic, read after `config.lookahead` imagined steps of the best of a few policies.
+        min(l, max_a Q) of the critic, read after `config.lookahead` imagined steps of the best of a few policies; or
+        what `config.law` says instead.
         """
-        self.require_stage("reachability")
-        held = self.critic.held_actions()
-        return look_ahead(self.imagination, latent, held, self.config.lookahead, self.critic)
+        self.require_stage(self.needed_stage)
+        still = self.normalise_action(self.hold_action(1))
+        if self.config.law == "margin":
+            margin = self.imagination.margin(latent)
+            return margin, self.imagination.complete(latent, still.expand(len(margin), -1))
+        critic = self.critic if self.config.law == "reachability" else None
+        return look_ahead(self.imagination, latent, self.critic.held_actions(still), self.config.lookahead, critic)
+
+    @property
+    def needed_stage(self) -> str:
+        """How far training must have come for this law to decide."""
+        return "reachability" if self.config.law == "reachability" else "world_model"
 
     # -- deployment ---
 
@@ -183,7 +193,7 @@ class LatentSafePolicy(PreTrainedPolicy):
     @torch.no_grad()
     def decide(self, batch: dict[str, Tensor], age_s: float = 0.0) -> FilterDecision:
         """Like `select_action`, with the whole decision."""
-        self.require_stage("reachability")
+        self.require_stage(self.needed_stage)
         if self.base is None:
             return self.shield(batch, None, age_s, without=Reason.NO_BASE_POLICY)
         try:

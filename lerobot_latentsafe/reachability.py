@@ -183,13 +183,13 @@ class SafetyCritic(nn.Module):
         """Features (..., D) -> what q and actor read (..., C)."""
         return (features - self.feature_mean) @ self.projection
 
-    def held_actions(self) -> Tensor:
-        """(K, A) actions worth holding: the candidates, or standing still and the extremes of each command."""
+    def held_actions(self, still: Tensor | None = None) -> Tensor:
+        """(K, A) actions worth holding: the candidates, or standing still (1, A) and the extremes of each command."""
         if self.discrete:
             return self.candidates
         moves = self.high > self.low
         extremes = [torch.diag(bound)[moves] for bound in (self.high, self.low)]
-        return torch.cat([torch.zeros_like(self.low)[None], *extremes])
+        return torch.cat([torch.zeros_like(self.low)[None] if still is None else still, *extremes])
 
     def between(self, share: Tensor) -> Tensor:
         """Continuous actions at these shares in [0, 1] of their ranges: (..., A)."""
