@@ -46,6 +46,14 @@ def test_card_has_a_header_and_the_command_that_makes_it(card):
     assert all(f"`{name}`" in text for name in recorded(CARDS[card])[2])
 
 
+@pytest.mark.parametrize("card", collect_franka.SOURCES)
+def test_card_gives_the_counts_that_were_measured(card):
+    counts = json.loads((FOLDER.parent / "results" / "franka" / "balance.json").read_text())[card]
+    stated = re.search(r"^At seed 0: .*$", (FOLDER / f"{card}.md").read_text(), re.MULTILINE)[0].replace(",", "")
+    for name in ("episodes", "frames", "failing_episodes", "failing_frames", "successful_episodes"):
+        assert str(counts[name]) in re.findall(r"\d+", stated)
+
+
 def test_no_card_is_left_over():
     assert {card.stem for card in FOLDER.glob("*.md")} == set(CARDS)
 
