@@ -55,6 +55,18 @@ def cache_root(dataset_root, tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
+def token_root(dataset_root, tmp_path_factory):
+    """The same dataset without images, with the offline encoder's tokens of its frames beside it."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from lerobot_latentsafe.datasets.build_cache import build_frame_cache
+
+    root = tmp_path_factory.mktemp("data") / "car_tokens"
+    build_frame_cache(LeRobotDataset(tiny.REPO_ID, root=dataset_root), root, tiny.TOKEN_SIZE, tiny.tokens())
+    return root
+
+
+@pytest.fixture(scope="session")
 def cache_meta(cache_root):
     return tiny.metadata(cache_root)
 

@@ -300,3 +300,43 @@ def test_monitor_mode_lets_everything_through_and_reports(strict):
     torch.testing.assert_close(decision.action, proposed)
     assert not decision.intervened.any() and decision.unsafe.all()
     assert decision.reason.tolist() == [Reason.UNSAFE_VALUE, Reason.ACTION_OUT_OF_RANGE, Reason.UNSAFE_VALUE]
+
+
+def test_fallback_keeps_its_grip(cache_meta, tmp_path):
+    """A kept command stays as it was last executed, whatever is proposed; the rest is the fallback's."""
+    from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+    from lerobot_latentsafe.training import train_reachability
+
+    options = dict(action_candidates=None, kept_commands=["turn_rate.vel"])
+    stage_one = tiny.train_stage_one(cache_meta, tmp_path / "one", **options)
+    train_reachability(stage_one, cache_meta, tmp_path / "two")
+    policy = LatentSafePolicy.from_pretrained(tmp_path / "two")
+    seen = tiny.observation([[-0.9, 0.1, 0.0]])
+    policy.config.epsilon = -2.0  # all passes
+    assert policy.shield(seen, torch.tensor([[0.7, 1.0]])).action[0, 0] == pytest.approx(0.7)
+    policy.config.epsilon = 2.0  # nothing passes
+    for _ in range(2):
+        decision = policy.shield(seen, torch.tensor([[-1.0, 1.0]]))
+        assert decision.intervened.all() and decision.action[0, 0] == pytest.approx(0.7, abs=1e-5)
+    assert policy.shield(seen, torch.full((1, 2), torch.nan)).action[0, 0] == pytest.approx(0.7, abs=1e-5)
+
+
+@pytest.mark.parametrize("law", ["plan", "margin"])
+def test_baseline_laws_need_no_critic(tiny_world_model, law):
+    from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, UntrainedFilterError
+
+    policy = LatentSafePolicy.from_pretrained(tiny_world_model)
+    seen, proposed = tiny.observation([[-0.9, 0.1, 0.0]]), torch.tensor([[0.0, 1.0]])
+    with pytest.raises(UntrainedFilterError, match="safety critic was never"):
+        policy.shield(seen, proposed)
+    policy.config.law = law
+    decision = policy.shield(seen, proposed)
+    assert decision.value.isfinite().all()
+    if law == "margin":
+        policy.config.epsilon = 2.0
+        torch.testing.assert_close(policy.shield(seen, proposed).action, policy.hold_action(1))
+
+
+def test_unknown_law_is_refused():
+    with pytest.raises(ValueError, match=r"law is 'luck'; expected one of reachability, plan, margin"):
+        tiny.config(law="luck")

@@ -29,6 +29,29 @@ def reachability_config(**changes):
     return ReachabilityConfig(**{**sizes, **changes})
 
 
+TOKEN_SIZE, COMPONENTS = 32, 8
+
+
+def tokens(**changes):
+    """Recipe of a token cache with the offline encoder."""
+    from functools import partial
+
+    from lerobot_latentsafe.datasets.build_cache import Tokens
+    from lerobot_latentsafe.world_models.perception import PerceptionConfig
+
+    perception = PerceptionConfig(encoder="efficientnet_lite0", components=COMPONENTS)
+    return partial(Tokens, **{"config": perception, **changes})
+
+
+def gru_config(**changes):
+    from lerobot_latentsafe.world_models import GRUConfig
+    from lerobot_latentsafe.world_models.perception import PerceptionConfig
+
+    perception = PerceptionConfig(encoder="efficientnet_lite0", components=COMPONENTS)
+    sizes = dict(perception=perception, image_size=TOKEN_SIZE, hidden=16, units=16, clip_length=8, observed=3)
+    return GRUConfig(**{**sizes, **changes})
+
+
 def config(**changes):
     options = dict(
         world_model=rssm_config(), reachability=reachability_config(), action_candidates=CANDIDATES, device="cpu",

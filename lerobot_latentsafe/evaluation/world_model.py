@@ -32,14 +32,14 @@ def evaluate_world_model(
     """
     generator = torch.Generator().manual_seed(seed)
     policy.eval()
-    with torch.no_grad():
-        return {
-            "errors": prediction_errors(policy, reader, episodes, n_windows, generator),
-            "margin": margin_quality(policy, reader, episodes, n_windows, generator),
-            "episodes": imagined_episodes(policy, reader, episodes, generator),
-        }
+    return {
+        "errors": prediction_errors(policy, reader, episodes, n_windows, generator),
+        "margin": margin_quality(policy, reader, episodes, n_windows, generator),
+        "episodes": imagined_episodes(policy, reader, episodes, generator),
+    }
 
 
+@torch.no_grad()
 def prediction_errors(
     policy: LatentSafePolicy, reader: ClipReader, episodes: np.ndarray, n: int, generator: torch.Generator
 ) -> dict:
@@ -70,6 +70,7 @@ def _errors(policy: LatentSafePolicy, latent: Latent, clip: Clip, action: Tensor
     return torch.stack(rows)
 
 
+@torch.no_grad()
 def margin_quality(
     policy: LatentSafePolicy, reader: ClipReader, episodes: np.ndarray, n: int, generator: torch.Generator
 ) -> dict:
@@ -86,6 +87,7 @@ def margin_quality(
     return row
 
 
+@torch.no_grad()
 def imagined_episodes(
     policy: LatentSafePolicy, reader: ClipReader, episodes: np.ndarray, generator: torch.Generator, horizon: int = 30
 ) -> dict:

