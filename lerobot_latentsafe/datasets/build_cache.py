@@ -179,12 +179,13 @@ def build_frame_cache(
     output_dir, folder = Path(output_dir), Path(output_dir) / FOLDER
     if not dataset.meta.camera_keys:
         raise FrameCacheError(f"{dataset.repo_id} has no camera; its features are {list(dataset.meta.features)}")
-    if output_dir.exists() and ((folder / MANIFEST).exists() or not folder.exists()):
+    rank, world = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
+    unfinished = folder.exists() and not (folder / MANIFEST).exists()
+    if rank == 0 and output_dir.exists() and not unfinished:
         raise FileExistsError(f"{output_dir} exists; choose another --output_dir or delete it")
     frames = DatasetFrames(dataset.meta)
     see = lambda episode: _episode_images(frames, episode, image_size)  # noqa: E731
     kept = recipe(frames.cameras, image_size)
-    rank, world = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
     if rank == 0:
         _lay_out(dataset, output_dir, kept, see)
     _await_layout(dataset, folder, kept)
