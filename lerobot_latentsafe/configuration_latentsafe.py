@@ -46,6 +46,8 @@ class LatentSafeConfig(PreTrainedConfig):
         fps, state_names, action_names, action_low, action_high, state_mean, state_std: what the filter was trained
             on, in robot units; filled in from the dataset.
         kept_commands: actions that the fallback never changes, such as `gripper.pos`: it moves, but keeps its grip.
+        fallback_moves: the commands that a continuous fallback may move, such as `delta_z.pos`; None: all. Where the
+            data seldom show a motion, the world model only guesses what it does, and the fallback would exploit that.
         fallback_low, fallback_high: the range of the fallback's continuous actions, in [-1, 1]: that which the data
             cover. Set by `latentsafe train-reachability`.
         action_varies: False for commands the data never vary; the filter keeps those and knows nothing else of them.
@@ -63,6 +65,7 @@ class LatentSafeConfig(PreTrainedConfig):
     reachability: ReachabilityConfig = field(default_factory=ReachabilityConfig)
     action_candidates: list[list[float]] | None = None
     kept_commands: list[str] = field(default_factory=list)
+    fallback_moves: list[str] | None = None
     fallback_low: list[float] | None = None
     fallback_high: list[float] | None = None
     stage: str = "untrained"

@@ -53,6 +53,9 @@ class LatentSafePolicy(PreTrainedPolicy):
                 "--policy.type=latentsafe --dataset.repo_id=..., or load one with --policy.path=..."
             )
         config.validate_features()
+        unknown = [n for n in (*config.kept_commands, *(config.fallback_moves or [])) if n not in config.action_names]
+        if unknown:
+            raise ValueError(f"no action is named {', '.join(unknown)}; there are {', '.join(config.action_names)}")
         n_actions = len(config.action_low)
         self.world_model = config.world_model.build(config.cameras, len(config.state_mean), n_actions)
         if self.reader is not None and self.reader.cache is not None:
@@ -75,7 +78,9 @@ class LatentSafePolicy(PreTrainedPolicy):
 
     def new_critic(self, candidates: Tensor | None) -> SafetyCritic:
         """A critic with fresh weights, bounded to the commands the fallback may move."""
+        names, chosen = self.config.action_names, self.config.fallback_moves
         moves = self.action_varies & ~self.kept
+        moves &= torch.tensor([chosen is None or name in chosen for name in names], device=moves.device)
         low, high = self.config.fallback_low, self.config.fallback_high
         low = torch.tensor(low) if low else -torch.ones(len(moves))
         high = torch.tensor(high) if high else torch.ones(len(moves))

@@ -467,3 +467,12 @@ def test_outer_processors_change_no_number(tiny_filter):
         torch.testing.assert_close(processed[key], value)
     action = torch.tensor([[1.2, 1.0]])
     torch.testing.assert_close(after(action), action)
+
+
+def test_fallback_moves_only_the_commands_it_may(cache_meta):
+    both = tiny.new_policy(cache_meta, action_candidates=None)
+    assert (both.critic.high > both.critic.low).tolist() == [True, False]  # the speed never varies
+    none = tiny.new_policy(cache_meta, action_candidates=None, fallback_moves=["speed.vel"])
+    assert not (none.critic.high > none.critic.low).any()
+    with pytest.raises(ValueError, match=r"no action is named lift; there are turn_rate\.vel"):
+        tiny.new_policy(cache_meta, action_candidates=None, fallback_moves=["lift"])
