@@ -95,8 +95,9 @@ def test_it_learns_to_obey_the_action():
         assert imagined_error(model, clip, shuffled) > 2 * imagined_error(model, clip, clip.action)
 
 
-def test_blind_control_sees_nothing():
-    model, _ = learn(blind=True)
+def test_blind_control_learns_from_proprioception_and_sees_nothing():
+    model, metrics = learn(blind=True)
+    assert metrics["loss_state"] < 1 and "loss_vector" not in metrics
     clip, other = random_clip(), random_clip()
     other.state, other.action = clip.state, clip.action
     with torch.no_grad():

@@ -109,8 +109,6 @@ class FrameGRU(WorldModel):
         length = clip.state.shape[1]
         observed = int(torch.randint(1, self.config.observed + 1, ()))
         seen = {**clip.percepts, "state": clip.state}
-        if self.config.blind:
-            seen["vector"] = torch.zeros_like(seen["vector"])
         latent = start = self.initial(len(clip.state))
         predicted, rows = [], []
         for t in range(length):
@@ -123,7 +121,7 @@ class FrameGRU(WorldModel):
         counts = (clip.valid & ~clip.is_first)[..., None].float()
         counts[:, 1:] *= clip.valid[:, :-1, None]
         losses = {}
-        for name in ("vector", "state"):
+        for name in ("state",) if self.config.blind else ("vector", "state"):
             truth = seen[name]
             change = torch.diff(truth, dim=1, prepend=truth[:, :1]).square() * counts
             error = (torch.stack([z[name] for z in predicted], 1) - truth).square() * counts
