@@ -118,3 +118,37 @@ def test_basis_of_pictures_is_refused(dataset, cache_root, tmp_path):
 def test_unknown_dtype_is_refused(dataset, tmp_path):
     with pytest.raises(ValueError, match="float16 or int8"):
         build_frame_cache(dataset, tmp_path / "new", tiny.TOKEN_SIZE, tiny.tokens(dtype="float8"))
+
+
+def test_folder_with_something_else_is_left_alone(dataset, tmp_path):
+    """Not even one that holds a beginning of a cache which this function did not make."""
+    (tmp_path / "mine" / "frame_cache").mkdir(parents=True)
+    (tmp_path / "mine" / "precious").write_text("data")
+    with pytest.raises(FileExistsError, match="another --output_dir"):
+        build_frame_cache(dataset, tmp_path / "mine", tiny.TOKEN_SIZE, tiny.tokens())
+    assert (tmp_path / "mine" / "precious").read_text() == "data"
+
+
+def test_build_killed_before_its_first_episode_starts_anew(dataset, token_root, tmp_path, monkeypatch):
+    prepare = build_cache.Tokens.prepare
+
+    def killed(*args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(build_cache.Tokens, "prepare", killed)
+    with pytest.raises(KeyboardInterrupt):
+        build_frame_cache(dataset, tmp_path / "new", tiny.TOKEN_SIZE, tiny.tokens())
+    assert not (tmp_path / "new").exists()
+    monkeypatch.setattr(build_cache.Tokens, "prepare", prepare)
+    build_frame_cache(dataset, tmp_path / "new", tiny.TOKEN_SIZE, tiny.tokens())
+    assert [path.name for path in tmp_path.iterdir()] == ["new"]
+    np.testing.assert_array_equal(arrays(tmp_path / "new")["vector"], arrays(token_root)["vector"])
+
+
+def test_cache_of_another_version_says_so(token_root, tmp_path):
+    import shutil
+
+    copy = shutil.copytree(token_root, tmp_path / "old")
+    tiny.rewrite_json(copy / "frame_cache" / "manifest.json", version=1)
+    with pytest.raises(FrameCacheError, match=r"is of version 1, this package reads version 2; delete it"):
+        FrameCache.open(copy)

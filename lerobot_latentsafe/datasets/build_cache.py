@@ -180,13 +180,13 @@ def build_frame_cache(
     if not dataset.meta.camera_keys:
         raise FrameCacheError(f"{dataset.repo_id} has no camera; its features are {list(dataset.meta.features)}")
     rank, world = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
-    unfinished = folder.exists() and not (folder / MANIFEST).exists()
+    unfinished = (folder / LAYOUT).exists() and not (folder / MANIFEST).exists()
     if rank == 0 and output_dir.exists() and not unfinished:
         raise FileExistsError(f"{output_dir} exists; choose another --output_dir or delete it")
     frames = DatasetFrames(dataset.meta)
     see = lambda episode: _episode_images(frames, episode, image_size)  # noqa: E731
     kept = recipe(frames.cameras, image_size)
-    if rank == 0:
+    if rank == 0 and not unfinished:
         _lay_out(dataset, output_dir, kept, see)
     _await_layout(dataset, folder, kept)
     kept.start(folder)
@@ -217,18 +217,17 @@ def _layout(dataset: "LeRobotDataset", kept: Recipe) -> dict:
 
 
 def _lay_out(dataset: "LeRobotDataset", output_dir: Path, kept: Recipe, see: See) -> None:
-    """Copy the dataset without images and make room for all frames, unless that was done before."""
+    """Copy the dataset without images and make room for all frames; output_dir appears when that is done."""
     from lerobot.datasets.dataset_tools import remove_feature
     from lerobot.utils.constants import ACTION, OBS_STATE
 
-    folder, n = output_dir / FOLDER, dataset.num_frames
-    if (folder / LAYOUT).exists():
-        return
-    shutil.rmtree(output_dir, ignore_errors=True)  # at most an earlier beginning of this function
+    begun = output_dir.with_name(f"{output_dir.name}.begun")
+    folder, n = begun / FOLDER, dataset.num_frames
+    shutil.rmtree(begun, ignore_errors=True)
     cameras = list(dataset.meta.camera_keys)
-    copy = remove_feature(dataset, cameras, output_dir=output_dir, repo_id=f"{dataset.repo_id}_cache")
+    copy = remove_feature(dataset, cameras, output_dir=begun, repo_id=f"{dataset.repo_id}_cache")
     if (Path(dataset.root) / "labels").exists():
-        shutil.copytree(Path(dataset.root) / "labels", output_dir / "labels")
+        shutil.copytree(Path(dataset.root) / "labels", begun / "labels")
     folder.mkdir()
     columns = copy.hf_dataset.with_format("numpy")
     np.save(folder / "state.npy", np.asarray(columns[OBS_STATE], np.float32).reshape(n, -1))
@@ -238,6 +237,7 @@ def _lay_out(dataset: "LeRobotDataset", output_dir: Path, kept: Recipe, see: See
     np.save(folder / DONE, np.zeros(dataset.num_episodes, bool))
     kept.prepare(folder, see, dataset.num_episodes)
     _write(folder / LAYOUT, _layout(dataset, kept))
+    begun.rename(output_dir)
 
 
 def _await_layout(dataset: "LeRobotDataset", folder: Path, kept: Recipe, patience_s: float = 600) -> None:
@@ -273,7 +273,7 @@ def _finish(dataset: "LeRobotDataset", output_dir: Path, kept: Recipe) -> FrameC
 
 
 def _write(file: Path, content: object) -> None:
-    """Atomically."""
-    partial = file.with_name(f"{file.name}.partial")
+    """Atomically, whichever of several processes does it."""
+    partial = file.with_name(f"{file.name}.{os.getpid()}.partial")
     partial.write_text(json.dumps(content, indent=2))
     os.replace(partial, file)

@@ -83,14 +83,17 @@ class FrameCache:
         folder = Path(root) / FOLDER
         try:
             manifest = json.loads((folder / MANIFEST).read_text())
-            if manifest["version"] != VERSION:
-                raise KeyError("version")
-            fingerprint = manifest["fingerprint"]
+            version, fingerprint = manifest["version"], manifest["fingerprint"]
         except (OSError, json.JSONDecodeError, KeyError, TypeError) as e:
             raise FrameCacheError(
                 f"{folder} has no readable {MANIFEST}; the build was cut off. Run the same latentsafe cache "
                 "again, which goes on where it stopped, or delete it"
             ) from e
+        if version != VERSION:
+            raise FrameCacheError(
+                f"{folder} is of version {version}, this package reads version {VERSION}; delete it and run latentsafe "
+                "cache again"
+            )
         if meta is not None and fingerprint != dataset_fingerprint(meta):
             raise FrameCacheError(
                 f"{folder} was made from {manifest['repo_id']} ({manifest['fingerprint']}), the dataset is "
