@@ -12,6 +12,7 @@ import torch
 from lerobot_latentsafe.datasets.clips import ClipReader
 from lerobot_latentsafe.datasets.labels import FAILING
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+from lerobot_latentsafe.world_models.base import map_latent
 
 
 @dataclass
@@ -37,21 +38,12 @@ class Calibration:
 @torch.no_grad()
 def episode_values(policy: LatentSafePolicy, reader: ClipReader, episodes: np.ndarray) -> list[dict[str, np.ndarray]]:
     """V and labels along whole episodes, filtered from their first frame: {value (T,), failure (T,)} each."""
-    if reader.cache is None:
-        raise ValueError("calibration reads encoded frames: run latentsafe cache and give its folder as --dataset.root")
-    device, rows = policy.device, []
+    rows = []
     for episode in episodes:
         index = np.flatnonzero(reader.labels.episode == episode)
-        percepts, state = reader.cache.frames(index, policy.world_model.percept_names)
-        state = policy.normalise_state(state.to(device))
-        action = policy.normalise_action(torch.from_numpy(reader.cache.action[index]).to(device))
-        latent, values = None, []
-        for t in range(len(index)):
-            frame = {k: percepts[k][t : t + 1].to(device) for k in policy.world_model.percept_names}
-            previous = action[t - 1 : t] if t else None
-            latent = policy.world_model.observe(latent, previous, frame, state[t : t + 1])
-            values.append(policy.value(latent).item())
-        rows.append({"value": np.array(values), "failure": reader.labels.failure[index]})
+        latents = policy.world_model.encode(reader.cut(index[:1], policy, length=len(index)))
+        value = policy.value(map_latent(latents, lambda t: t[0]))
+        rows.append({"value": value.cpu().numpy(), "failure": reader.labels.failure[index]})
     return rows
 
 

@@ -83,7 +83,7 @@ class Cache:
     """Copy a dataset without its images and store what a world model sees of its frames beside it.
 
     That is each frame, decoded and resized, for an RSSM; with --encoder, the tokens of a frozen encoder and their
-    principal components, for a token world model (gru, dino_wm). A killed build goes on if it is started again;
+    principal components, for a token world model (gru). A killed build goes on if it is started again;
     `torchrun --nproc_per_node=N $(which latentsafe) cache ...` shares the work among processes.
     """
 
@@ -139,21 +139,11 @@ class EvalWorldModel:
     def run(self) -> None:
         import numpy as np
 
-        from lerobot_latentsafe.datasets.clips import ClipReader
         from lerobot_latentsafe.evaluation.rollouts import provenance, write_json
         from lerobot_latentsafe.evaluation.world_model import evaluate_world_model
-        from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, adopt_dataset
+        from lerobot_latentsafe.training import load_with_cache
 
-        policy = LatentSafePolicy.from_pretrained(self.policy.path)
-        policy.require_stage("world_model")
-        meta = self.dataset.metadata()
-        adopt_dataset(policy.config, meta, meta.stats)
-        policy.config.frame_cache = None
-        reader = ClipReader.of_dataset(policy.config, meta)
-        if reader.cache is None:
-            raise ValueError(
-                f"{meta.repo_id} is not cached: run latentsafe cache and give its folder as --dataset.root"
-            )
+        policy, reader = load_with_cache(self.policy.path, self.dataset.metadata(), self.seed)
         episodes = np.unique(reader.labels.episode)[-self.n_episodes :]
         row = evaluate_world_model(policy, reader, episodes, self.seed)
         for part, numbers in row.items():
@@ -235,15 +225,10 @@ class Calibrate:
         import numpy as np
 
         from lerobot_latentsafe.calibration import calibrate, episode_values, store
-        from lerobot_latentsafe.datasets.clips import ClipReader
-        from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, adopt_dataset
-        from lerobot_latentsafe.training import refuse_existing, save_filter
+        from lerobot_latentsafe.training import load_with_cache, refuse_existing, save_filter
 
         refuse_existing(self.output_dir)
-        policy = LatentSafePolicy.from_pretrained(self.policy.path)
-        meta = self.dataset.metadata()
-        adopt_dataset(policy.config, meta, meta.stats)
-        reader = ClipReader.of_dataset(policy.config, meta)
+        policy, reader = load_with_cache(self.policy.path, self.dataset.metadata())
         episodes = np.unique(reader.labels.episode)[-self.n_episodes :]
         found = calibrate(episode_values(policy, reader, episodes), self.max_missed, self.lead_steps)
         store(policy, found)

@@ -76,7 +76,8 @@ def train_margin(path: str | Path, dataset_meta, output_dir: Path, seed: int = 0
         UntrainedFilterError: the world model was never trained.
         FileExistsError: output_dir holds a checkpoint already.
     """
-    policy, reader = _load_frozen(path, dataset_meta, output_dir, seed)
+    refuse_existing(output_dir)
+    policy, reader = load_with_cache(path, dataset_meta, seed)
     generator = torch.Generator().manual_seed(seed)
     config, started = policy.config, time.process_time()
     features, failure = seen_and_imagined(policy, reader, config.margin_clips, generator)
@@ -88,20 +89,20 @@ def train_margin(path: str | Path, dataset_meta, output_dir: Path, seed: int = 0
     return policy
 
 
-def _load_frozen(path: str | Path, dataset_meta, output_dir: Path, seed: int) -> tuple[LatentSafePolicy, ClipReader]:
-    """A trained world model and the reader of a cached dataset, after every check that costs nothing."""
-    refuse_existing(output_dir)
+def load_with_cache(path: str | Path, dataset_meta, seed: int = 0) -> tuple[LatentSafePolicy, ClipReader]:
+    """A filter with a trained world model, and the reader of a cached dataset that fits it.
+
+    Raises:
+        UntrainedFilterError: the world model was never trained.
+        ValueError: the dataset is another robot's, or not cached.
+    """
     torch.manual_seed(seed)
     policy = LatentSafePolicy.from_pretrained(path)
     policy.require_stage("world_model")
     adopt_dataset(policy.config, dataset_meta, dataset_meta.stats)
     policy.config.frame_cache = None  # that of the first stage may be gone; the dataset brings its own
     reader = ClipReader.of_dataset(policy.config, dataset_meta)
-    if reader.cache is None:
-        raise ValueError(
-            "training on a frozen world model reads cached frames: run latentsafe cache on the dataset and give its "
-            "folder as --dataset.root"
-        )
+    reader.require_cache()
     return policy, reader
 
 
@@ -162,7 +163,8 @@ def train_reachability(
     """
     from tqdm import trange
 
-    policy, reader = _load_frozen(path, dataset_meta, output_dir, seed)
+    refuse_existing(output_dir)
+    policy, reader = load_with_cache(path, dataset_meta, seed)
     config = policy.config.reachability
     if steps is not None:
         config.steps = steps

@@ -19,7 +19,8 @@ from lerobot_latentsafe.datasets.labels import SAFE
 from lerobot_latentsafe.evaluation.rollouts import confusion, provenance, write_json
 from lerobot_latentsafe.labeling.suggestions import Suggestion
 from lerobot_latentsafe.margin import FailureMargin, hinge_loss
-from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, adopt_dataset
+from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+from lerobot_latentsafe.training import load_with_cache
 
 SHARES = (0.01, 0.02, 0.05, 0.1, 0.2, 1.0)
 ORDERS = {
@@ -97,9 +98,7 @@ def main() -> None:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
     meta = LeRobotDatasetMetadata(arguments.repo_id, root=arguments.root)
-    policy = LatentSafePolicy.from_pretrained(arguments.policy).eval()
-    adopt_dataset(policy.config, meta, meta.stats)
-    reader = ClipReader.of_dataset(policy.config, meta)
+    policy, reader = load_with_cache(arguments.policy, meta)
     episode = reader.labels.episode
     n, longest = episode.max() + 1, int(np.bincount(episode).max())
     features = encode(policy, reader, longest)

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import tiny
+import torch
 
 from lerobot_latentsafe.calibration import calibrate, episode_values, store
 from lerobot_latentsafe.commands import Calibrate, DatasetSource, PolicySource
@@ -100,3 +101,18 @@ def test_untrained_critic_cannot_be_calibrated(tiny_world_model, cache_root, tmp
     dataset = DatasetSource(tiny.REPO_ID, str(cache_root))
     with pytest.raises(UntrainedFilterError):
         Calibrate(PolicySource(str(tiny_world_model)), tmp_path / "out", dataset).run()
+
+
+def test_episodes_start_with_the_grip_they_had(cache_meta):
+    """A kept command has no zero to start from: calibration and training begin an episode alike."""
+    policy = tiny.new_policy(cache_meta, action_candidates=None, kept_commands=["turn_rate.vel"])
+    policy.config.law = "margin"
+    policy.config.stage = "world_model"
+    index = np.flatnonzero(policy.reader.labels.episode == 2)
+    clip = policy.reader.cut(index[:1], policy, length=len(index))
+    assert clip.action[0, 0, 0] == pytest.approx(
+        policy.normalise_action(torch.from_numpy(policy.reader.cache.action[index[:1]]))[0, 0].item()
+    )
+    margin = policy.imagination.margin(policy.world_model.encode(clip))[0]
+    row = episode_values(policy, policy.reader, np.array([2]))[0]
+    np.testing.assert_allclose(row["value"], margin.detach(), atol=1e-6)

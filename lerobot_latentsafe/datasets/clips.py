@@ -79,8 +79,14 @@ class ClipReader:
         window = np.minimum(index[:, None] + np.arange(self.length), len(self.labels.failure) - 1)
         return self._assemble(window, percepts, state, action, valid, policy)
 
+    def require_cache(self) -> None:
+        """Raise ValueError unless the dataset is cached: only training decodes videos."""
+        if self.cache is None:
+            raise ValueError("this reads cached frames: run latentsafe cache and give its folder as --dataset.root")
+
     def cut(self, start: np.ndarray, policy: "LatentSafePolicy", length: int | None = None) -> Clip:
         """Clips from the frame cache that start at the given frame indices (B,); by default of the training length."""
+        self.require_cache()
         window = start[:, None] + np.arange(length or self.length)
         inside = np.minimum(window, len(self.labels.episode) - 1)
         valid = (window == inside) & (self.labels.episode[inside] == self.labels.episode[start][:, None])

@@ -85,7 +85,7 @@ def _margins(policy, frames: DatasetFrames, episodes: list[int]) -> list[np.ndar
     stack = lambda rows: pad(rows, batch_first=True).to(policy.device)  # noqa: E731
     valid = torch.arange(max(length)) < torch.tensor(length)[:, None]
     action = stack([action for _, _, action in seen])
-    previous = torch.cat([torch.zeros_like(action[:, :1]), action[:, :-1]], 1)
+    previous = torch.cat([policy.first_action(action[:, :1]), action[:, :-1]], 1)
     is_first = torch.zeros_like(valid)
     is_first[:, 0] = True
     unknown = torch.full(valid.shape, -1)
