@@ -5,12 +5,13 @@ what the filter's encoder sees: `with_vectors` adds that to a cached dataset, an
 observations, so that the trained policy runs wherever there are cameras.
 """
 
+import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 from lerobot.configs import FeatureType, PipelineFeatureType, PolicyFeature
-from lerobot.processor import ObservationProcessorStep, ProcessorStepRegistry
+from lerobot.processor import DeviceProcessorStep, ObservationProcessorStep, ProcessorStepRegistry
 from lerobot.utils.constants import OBS_ENV_STATE
 
 if TYPE_CHECKING:
@@ -91,8 +92,6 @@ def let_see(checkpoint: str | Path, cache_root: str | Path, output_dir: str | Pa
     Raises:
         FileExistsError: output_dir exists.
     """
-    import shutil
-
     from lerobot.configs.policies import PreTrainedConfig
     from lerobot.policies.factory import make_pre_post_processors
 
@@ -110,7 +109,7 @@ def let_see(checkpoint: str | Path, cache_root: str | Path, output_dir: str | Pa
     step.perception.load_basis(Path(cache_root))
     pre, post = make_pre_post_processors(config, pretrained_path=checkpoint)
     # After images are batched and on the device, before anything is normalised.
-    at = next(i for i, s in enumerate(pre.steps) if "Device" in type(s).__name__) + 1
+    at = next(i for i, s in enumerate(pre.steps) if isinstance(s, DeviceProcessorStep)) + 1
     pre.steps.insert(at, step)
     output_dir.mkdir(parents=True)
     for name in ("config.json", "model.safetensors"):

@@ -2,7 +2,7 @@
 
 z_t = (h_t, v_t, s_t): h_t remembers what was done and seen, v_t are the leading principal components of all the frame's
 tokens, s_t is proprioception. v and s are predicted as changes. A frame is one vector here, not a grid of tokens as in
-DINO-WM, which makes a step of imagination some hundred times cheaper.
+DINO-WM, which makes imagination cheap.
 
 Trained open loop: a few frames are observed, the rest of the clip is imagined under the recorded actions. One-step
 losses teach a model to copy the last frame and to ignore the action (see `evaluation/world_model.py`).
