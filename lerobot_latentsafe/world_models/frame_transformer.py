@@ -1,0 +1,117 @@
+"""A transformer over frames of patch tokens that can be run frame by frame, exactly.
+
+Tokens see all tokens of their own frame and of the H - 1 frames before it. Time enters only as rotations of the keys by
+their age (rotary embedding, relative), so keys and values of a past frame stay what they are when the window slides on:
+one frame at a time with keys and values kept gives what a pass over the whole sequence gives.
+"""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+ROTARY_BASE = 100.0
+"""Ages are a few frames, so frequencies go down to 1 / 100 radians a frame only."""
+
+
+class FrameTransformer(nn.Module):
+    """Pre-norm transformer, H frames wide, with a last layer norm.
+
+    Args:
+        dim: d, width of the tokens.
+        depth, heads, head_dim, mlp: layers, attention heads and their width, hidden width of the feed-forward layers.
+        history: H, frames a token sees, its own included.
+        condition_dim: width of a condition that scales, shifts and gates every layer (AdaLN); None for none.
+    """
+
+    def __init__(
+        self, dim: int, depth: int, heads: int, head_dim: int, mlp: int, history: int, condition_dim: int | None = None
+    ):
+        super().__init__()
+        self.history, self.kept_dim = history, 2 * heads * head_dim
+        self.blocks = nn.ModuleList(_Block(dim, heads, head_dim, mlp, condition_dim) for _ in range(depth))
+        self.norm = nn.LayerNorm(dim)
+        frequency = ROTARY_BASE ** -(torch.arange(head_dim // 2) / (head_dim // 2))
+        age = torch.arange(history - 1, -1, -1.0)
+        self.register_buffer("angle", age[:, None] * frequency, persistent=False)
+
+    def forward(
+        self, x: Tensor, seen: Tensor, past: list[Tensor] | None = None, condition: Tensor | None = None
+    ) -> tuple[Tensor, list[Tensor]]:
+        """Tokens of T frames that follow the past.
+
+        Args:
+            x: (B, T, P, d).
+            seen: int (B, T), how many frames each frame may look at, itself included; more than H counts as H.
+            past: for each layer keys and values of the H - 1 frames before, (B, H - 1, P, 2 K); None if there are none.
+            condition: (B, T, C).
+
+        Returns:
+            (B, T, P, d), and for each layer the keys and values of all H - 1 + T frames, (B, H - 1 + T, P, 2 K).
+        """
+        batch, length, n_patches, _ = x.shape
+        past = self.empty_past(batch, n_patches) if past is None else past
+        age = torch.arange(self.history - 1, -1, -1, device=x.device)
+        visible = (age < seen[..., None]) | (age == 0)
+        visible = visible.repeat_interleave(n_patches, -1).view(batch * length, 1, 1, -1)
+        rotation = torch.polar(torch.ones_like(self.angle), self.angle)
+        kept = []
+        for block, before in zip(self.blocks, past):
+            x, frames = block(x, before, visible, rotation, condition)
+            kept.append(frames)
+        return self.norm(x), kept
+
+    def empty_past(self, batch_size: int, n_patches: int) -> list[Tensor]:
+        """Keys and values before the first frame, which nothing may look at."""
+        shape = (batch_size, self.history - 1, n_patches, self.kept_dim)
+        return [self.angle.new_zeros(shape) for _ in self.blocks]
+
+
+class _Block(nn.Module):
+    def __init__(self, dim: int, heads: int, head_dim: int, mlp: int, condition_dim: int | None):
+        super().__init__()
+        self.heads, self.inner = heads, heads * head_dim
+        plain = condition_dim is None
+        self.attention_norm = nn.LayerNorm(dim, elementwise_affine=plain)
+        self.qkv = nn.Linear(dim, 3 * self.inner, bias=False)
+        self.out = nn.Linear(self.inner, dim)
+        self.mlp_norm = nn.LayerNorm(dim, elementwise_affine=plain)
+        self.mlp = nn.Sequential(nn.Linear(dim, mlp), nn.GELU(), nn.Linear(mlp, dim))
+        self.modulation = None if plain else nn.Linear(condition_dim, 6 * dim)
+        if self.modulation is not None:  # start as a plain block: no shift, no scale, open gates
+            nn.init.zeros_(self.modulation.weight)
+            with torch.no_grad():
+                self.modulation.bias.copy_(torch.tensor([0.0, 0.0, 1.0] * 2).repeat_interleave(dim))
+
+    def forward(
+        self, x: Tensor, past: Tensor, visible: Tensor, rotation: Tensor, condition: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        if self.modulation is None:
+            attended, kept = self._attend(self.attention_norm(x), past, visible, rotation)
+            x = x + attended
+            return x + self.mlp(self.mlp_norm(x)), kept
+        shift, scale, gate, mlp_shift, mlp_scale, mlp_gate = self.modulation(condition).unsqueeze(-2).chunk(6, -1)
+        y = torch.addcmul(shift, self.attention_norm(x), 1 + scale)
+        attended, kept = self._attend(y, past, visible, rotation)
+        x = torch.addcmul(x, attended, gate)
+        y = torch.addcmul(mlp_shift, self.mlp_norm(x), 1 + mlp_scale)
+        return torch.addcmul(x, self.mlp(y), mlp_gate), kept
+
+    def _attend(self, x: Tensor, past: Tensor, visible: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor]:
+        """Each of T frames attends to the window of H frames that ends with it; also returns keys and values."""
+        batch, length, n_patches, _ = x.shape
+        n, history = batch * length, past.shape[1] + 1
+        query, new = self.qkv(x).split([self.inner, 2 * self.inner], -1)
+        kept = torch.cat([past, new], 1)
+        window = kept.unfold(1, history, 1).movedim(-1, 2)  # (B, T, H, P, 2 K); a view if T is 1
+        key, value = window.reshape(n, history * n_patches, 2, self.heads, -1).unbind(2)
+        key = _rotate(key.unflatten(1, (history, n_patches)), rotation[:, None, None]).flatten(1, 2)
+        query = query.reshape(n, n_patches, self.heads, -1)
+        query, key, value = (t.transpose(1, 2) for t in (query, key, value))
+        attended = F.scaled_dot_product_attention(query, key, value, attn_mask=visible)
+        return self.out(attended.transpose(1, 2).reshape(batch, length, n_patches, -1)), kept
+
+
+def _rotate(x: Tensor, rotation: Tensor) -> Tensor:
+    """Turn pairs of numbers in the last axis (..., 2 n) by unit complex numbers (..., n)."""
+    pairs = torch.view_as_complex(x.unflatten(-1, (-1, 2)))
+    return torch.view_as_real(pairs * rotation).flatten(-2)
