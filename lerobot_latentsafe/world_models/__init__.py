@@ -1,7 +1,19 @@
 """World models behind one contract; importing this registers their configurations."""
 
 from lerobot_latentsafe.world_models.base import Clip, Latent, WorldModel, WorldModelConfig
+from lerobot_latentsafe.world_models.dino_wm import DinoWM, DinoWMConfig
 from lerobot_latentsafe.world_models.gru import FrameGRU, GRUConfig
 from lerobot_latentsafe.world_models.rssm import RSSM, RSSMConfig
 
-__all__ = ["RSSM", "Clip", "FrameGRU", "GRUConfig", "Latent", "RSSMConfig", "WorldModel", "WorldModelConfig"]
+__all__ = [
+    "RSSM",
+    "Clip",
+    "DinoWM",
+    "DinoWMConfig",
+    "FrameGRU",
+    "GRUConfig",
+    "Latent",
+    "RSSMConfig",
+    "WorldModel",
+    "WorldModelConfig",
+]

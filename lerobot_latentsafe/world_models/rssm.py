@@ -12,7 +12,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from lerobot_latentsafe.world_models.base import Clip, Latent, WorldModel, WorldModelConfig
+from lerobot_latentsafe.world_models.base import Clip, Latent, WorldModelConfig
+from lerobot_latentsafe.world_models.ends import EndAware
 
 
 @WorldModelConfig.register_subclass("rssm")
@@ -131,7 +132,7 @@ class _ImageDecoder(nn.Module):
         return self.net(x.contiguous(memory_format=torch.channels_last))
 
 
-class RSSM(WorldModel):
+class RSSM(EndAware):
     """See the module's text. Latent: h (B, H), mean and std of x (B, S), and the x (B, S) carried on."""
 
     def __init__(self, config: RSSMConfig, image_keys: list[str], state_dim: int, action_dim: int):
@@ -169,7 +170,6 @@ class RSSM(WorldModel):
             nn.LayerNorm(hidden, eps=1e-3),
         )
         self.posterior_out = nn.Linear(hidden, 2 * x)
-        self.register_buffer("ends_seen", torch.zeros(()))
         self.h0 = nn.Parameter(torch.zeros(h))
         self.continues = nn.Sequential(_mlp(self.feature_dim, config.state_units, 1), nn.Linear(config.state_units, 1))
 
@@ -188,10 +188,6 @@ class RSSM(WorldModel):
 
     def features(self, latent: Latent) -> Tensor:
         return torch.cat([latent["x"], latent["h"]], -1)
-
-    def ended(self, latent: Latent) -> Tensor:
-        over = self.continues(self.features(latent)).squeeze(-1) < 0
-        return over & (self.ends_seen > 0)  # a head that never saw an end knows nothing
 
     def error(self, latent: Latent, percepts: dict[str, Tensor], state: Tensor) -> Tensor:
         decoded = self.decode(self.features(latent))
@@ -258,7 +254,7 @@ class RSSM(WorldModel):
             + error_state
             + self.config.dynamics_scale * kl_dynamics
             + self.config.representation_scale * kl_representation
-            + self._continue_loss(features, clip)
+            + self.end_loss(features, clip)
         )
         metrics = {key: value.item() for key, value in error.items()}
         return loss, features, {**metrics, "loss_state": error_state.item(), "kl": kl.item()}
@@ -289,15 +285,6 @@ class RSSM(WorldModel):
             mean_of(representation.clamp(min=free)),
             mean_of(dynamics).detach(),
         )
-
-    def _continue_loss(self, features: Tensor, clip: Clip) -> Tensor:
-        known = (clip.terminal >= 0) & clip.valid
-        if not known.any():
-            return features.sum() * 0.0
-        if self.training:
-            self.ends_seen += (clip.terminal[known] == 1).any()
-        logits = self.continues(features.detach()).squeeze(-1)[known]
-        return F.binary_cross_entropy_with_logits(logits, (clip.terminal[known] == 0).float())
 
     @torch.no_grad()
     def _update_mean_image(self, clip: Clip, settle_after: int = 200) -> None:
