@@ -52,6 +52,18 @@ def gru_config(**changes):
     return GRUConfig(**{**sizes, **changes})
 
 
+def dino_wm_config(**changes):
+    from lerobot_latentsafe.world_models import DinoWMConfig
+    from lerobot_latentsafe.world_models.perception import PerceptionConfig
+
+    perception = PerceptionConfig(encoder="efficientnet_lite0", components=COMPONENTS)
+    sizes = dict(
+        perception=perception, image_size=TOKEN_SIZE, clip_length=8, dim=32, depth=2, heads=2, head_dim=8, mlp=32,
+        embedding=4, summary=8,
+    )  # fmt: skip
+    return DinoWMConfig(**{**sizes, **changes})
+
+
 def config(**changes):
     options = dict(
         world_model=rssm_config(), reachability=reachability_config(), action_candidates=CANDIDATES, device="cpu",

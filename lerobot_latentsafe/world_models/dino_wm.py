@@ -6,8 +6,8 @@ change. Past frames are there as keys and values (see `frame_transformer.py`): `
 same `step` serves training, imagination and the shield.
 
 As published, with the action concatenated and a one-step loss, such a model ignores the action: from one frame to the
-next hardly anything changes. So by default action and proprioception modulate every layer (AdaLN), the rest of each clip
-is imagined from its start (open loop), and what changes weighs more than what does not.
+next hardly anything changes. So by default action and proprioception modulate every layer (AdaLN), the rest of each
+clip is imagined from its start (open loop), and what changes weighs more than what does not.
 """
 
 from dataclasses import dataclass, field

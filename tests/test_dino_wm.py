@@ -1,0 +1,317 @@
+"""DINO-WM: the contract, exact streaming, and that it obeys the action."""
+
+from pathlib import Path
+
+import draccus
+import pytest
+import tiny
+import torch
+import yaml
+
+from lerobot_latentsafe.world_models import Clip, DinoWM, WorldModelConfig
+from lerobot_latentsafe.world_models.base import map_latent, select
+
+KEYS, STATE_DIM, ACTION_DIM = ["observation.images.wrist", "observation.images.front"], 3, 2
+SIDE, TOKEN_DIM = 3, 4
+P = SIDE**2
+PAPER = Path(__file__).parents[1] / "configs" / "bag_dino_wm_paper.yaml"
+
+
+def build(**changes):
+    return DinoWM(tiny.dino_wm_config(**changes), KEYS, STATE_DIM, ACTION_DIM, P, TOKEN_DIM)
+
+
+@pytest.fixture(params=["adaln", "concat"])
+def model(request):
+    model = build(conditioning=request.param).eval()
+    for block in model.transformer.blocks:
+        if block.modulation is not None:  # starts at zero, where all actions are alike
+            torch.nn.init.normal_(block.modulation.weight, std=0.2)
+    return model
+
+
+def random_clip(batch=3, length=8):
+    return _clip(torch.randn(batch, length, P, TOKEN_DIM), torch.randn(batch, length, STATE_DIM), None)
+
+
+def blobs(batch=32, length=8):
+    """A blob that both cameras see and the action moves; proprioception says nothing of it."""
+    action = 2 * torch.rand(batch, length, ACTION_DIM) - 1
+    place = (0.5 * action).cumsum(1) + SIDE / 2 - 0.5 + 0.5 * torch.randn(batch, 1, ACTION_DIM)
+    grid = torch.cartesian_prod(torch.arange(SIDE), torch.arange(SIDE)).float()
+    brightness = torch.exp(-(grid - place[:, :, None]).square().sum(-1) / 2)
+    tokens = brightness[..., None] * torch.tensor([1.0, -1.0, 0.5, 2.0])
+    return _clip(tokens, torch.randn(batch, length, STATE_DIM) * 0.01, action)
+
+
+def _clip(tokens, state, action):
+    batch, length = state.shape[:2]
+    is_first = torch.zeros(batch, length, dtype=torch.bool)
+    is_first[:, 0] = True
+    action = 2 * torch.rand(batch, length, ACTION_DIM) - 1 if action is None else action
+    unknown = torch.full((batch, length), -1)
+    return Clip({"tokens": tokens}, state, action, is_first, torch.ones_like(is_first), unknown, unknown.clone())
+
+
+def filtered(model, clip, n):
+    latent = None
+    for t in range(n):
+        percepts = {"tokens": clip.percepts["tokens"][:, t]}
+        latent = model.observe(latent, clip.action[:, t], percepts, clip.state[:, t])
+    return latent
+
+
+def assert_same(latent, other, **tolerance):
+    assert latent.keys() == other.keys()
+    for name in latent:
+        torch.testing.assert_close(latent[name], other[name], **tolerance)
+
+
+# -- the contract ---
+
+
+def test_latent_is_batch_first_and_remembers_the_action(model):
+    latent = filtered(model, random_clip(), 4)
+    assert all(len(value) == 3 for value in latent.values())
+    action = torch.rand(3, ACTION_DIM)
+    after = model.step(latent, action)
+    assert torch.equal(after["action"], action) and {k: v.shape for k, v in after.items()} == {
+        k: v.shape for k, v in latent.items()
+    }
+    assert model.features(latent).shape == (3, model.feature_dim)
+    assert model.percept_names == ["tokens"]
+
+
+@torch.no_grad()
+def test_streaming_equals_the_full_forward(model):
+    """Frame by frame, through the public contract, against all frames at once, well beyond the window."""
+    clip = random_clip(length=12)
+    tokens, state = clip.percepts["tokens"], clip.state
+    seen = model._frames_seen(clip.is_first)
+    ahead = model._advance(tokens[:, :-1], state[:, :-1], clip.action[:, 1:], seen[:, :-1])
+    latent = model.initial(3)
+    for t in range(11):
+        latent = model.observe(latent, clip.action[:, t], {"tokens": tokens[:, t]}, state[:, t])
+        predicted = model.step(latent, clip.action[:, t + 1])
+        for name in ("tokens", "state", "context"):
+            torch.testing.assert_close(predicted[name], getattr(ahead, name)[:, t], atol=1e-5, rtol=0)
+
+
+@torch.no_grad()
+def test_imagining_a_batch_equals_imagining_one_by_one(model):
+    clip = random_clip(batch=5)
+    start = filtered(model, clip, 4)
+    together, alone = start, [select(start, slice(i, i + 1)) for i in range(5)]
+    for t in range(4, 8):
+        together = model.step(together, clip.action[:, t])
+        alone = [model.step(z, clip.action[i : i + 1, t]) for i, z in enumerate(alone)]
+    joined = {name: torch.cat([z[name] for z in alone]) for name in together}
+    assert_same(together, joined, atol=1e-5, rtol=1e-5)
+
+
+def test_gradients_reach_the_action_through_imagination(model):
+    action = torch.zeros(3, ACTION_DIM, requires_grad=True)
+    latent = filtered(model, random_clip(), 3)
+    for _ in range(3):
+        latent = model.step(latent, action)
+    model.features(latent).square().sum().backward()
+    assert action.grad.isfinite().all() and (action.grad != 0).all()
+
+
+@torch.no_grad()
+def test_correcting_takes_over_what_was_seen_and_keeps_the_past(model):
+    clip = random_clip()
+    predicted = model.step(filtered(model, clip, 3), clip.action[:, 3])
+    seen = model.correct(predicted, {"tokens": clip.percepts["tokens"][:, 3]}, clip.state[:, 3])
+    assert torch.equal(seen["tokens"], clip.percepts["tokens"][:, 3]) and torch.equal(seen["state"], clip.state[:, 3])
+    assert all(torch.equal(seen[name], predicted[name]) for name in (*model.past_names, "seen", "context"))
+    for changed in (
+        model.correct(predicted, {"tokens": 1 + clip.percepts["tokens"][:, 3]}, clip.state[:, 3]),
+        model.correct(predicted, {"tokens": clip.percepts["tokens"][:, 3]}, 1 + clip.state[:, 3]),
+    ):
+        assert not torch.allclose(model.features(changed), model.features(seen))
+        after, other = (model.step(z, clip.action[:, 4]) for z in (changed, seen))
+        assert not torch.allclose(after["context"], other["context"])
+
+
+@torch.no_grad()
+def test_nothing_before_the_first_frame_matters(model):
+    clip, other = random_clip(), random_clip()
+    clip.is_first[:, 3] = True
+    for old, new in (
+        (other.percepts["tokens"], clip.percepts["tokens"]), (other.state, clip.state), (other.action, clip.action)
+    ):  # fmt: skip
+        old[:, 4:] = new[:, 4:]
+    other.percepts["tokens"][:, 3], other.state[:, 3] = clip.percepts["tokens"][:, 3], clip.state[:, 3]
+    other.is_first = clip.is_first
+    late = [model.features(map_latent(model.encode(c), lambda t: t[:, 3:])) for c in (clip, other)]
+    torch.testing.assert_close(*late)
+    clip.is_first[:, 3] = False
+    assert not torch.allclose(model.features(model.encode(clip))[:, 3:], late[0])
+
+
+@torch.no_grad()
+def test_the_first_frame_has_no_context_whatever_led_to_it(model):
+    clip = random_clip()
+    a = model.observe(None, clip.action[:, 0], {"tokens": clip.percepts["tokens"][:, 0]}, clip.state[:, 0])
+    b = model.observe(None, -clip.action[:, 0], {"tokens": clip.percepts["tokens"][:, 0]}, clip.state[:, 0])
+    torch.testing.assert_close(model.features(a), model.features(b))
+    torch.testing.assert_close(model.step(a, clip.action[:, 1])["tokens"], model.step(b, clip.action[:, 1])["tokens"])
+
+
+def test_nothing_has_ended_before_an_end_was_ever_seen():
+    model, clip = build().train(), random_clip()
+    with torch.no_grad():
+        model.continues[-1].bias.fill_(-100.0)  # the head says that every episode is over
+    model.loss(clip)
+    assert not model.ended(model.encode(clip)).any()
+    clip.terminal[0, -1] = 1
+    model.loss(clip)
+    assert model.ended(model.encode(clip)).all()
+
+
+# -- learning ---
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("options", [{}, {"open_loop": 0.0}, {"change_weight": 0.0}, {"blind": True}])
+def test_padding_and_other_episodes_count_for_nothing(options):
+    model, losses = build(**options).eval(), []
+    clip = random_clip()
+    clip.valid[0, 5:] = False
+    clip.is_first[1, 4] = True
+    for _ in range(2):
+        loss, features, _ = model.loss(clip)
+        losses.append((loss, torch.where(clip.valid[..., None], features, 0.0)))
+        clip.percepts["tokens"][0, 5:] += 100
+        clip.state[0, 5:] -= 100
+    torch.testing.assert_close(*losses)
+
+
+@torch.no_grad()
+def test_features_of_the_loss_are_those_of_latents_seen_and_then_imagined():
+    model, clip = build(observed=3).eval(), random_clip()
+    clip.is_first[1, 6] = True
+    features = model.loss(clip)[1]
+    encoded = model.encode(clip)
+    torch.testing.assert_close(features[:, :3], model.features(encoded)[:, :3], atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(features[1, 6:], model.features(encoded)[1, 6:], atol=1e-5, rtol=1e-4)
+    latent = map_latent(encoded, lambda t: t[:, 2])
+    for t in range(3, 8):
+        latent = model.step(latent, clip.action[:, t])
+        imagined = [0, 2] if t >= 6 else [0, 1, 2]
+        torch.testing.assert_close(features[imagined, t], model.features(latent)[imagined], atol=1e-5, rtol=1e-4)
+
+
+def test_every_parameter_learns_but_the_continuation_until_ends_are_known():
+    for conditioning in ("adaln", "concat"):
+        model = build(conditioning=conditioning).train()
+        loss, features, metrics = model.loss(random_clip())
+        (loss + features.square().sum()).backward()
+        idle = {name for name, p in model.named_parameters() if p.grad is None or not p.grad.any()}
+        assert idle and all(name.startswith("continues.") for name in idle)
+        assert all(isinstance(v, float) and v == v for v in metrics.values())
+
+
+def learn(**options):
+    torch.manual_seed(0)
+    model = build(**{"clip_length": 8, **options}).train()
+    optimizer = torch.optim.AdamW(model.parameters(), 3e-3)
+    for _ in range(200):
+        loss, *_ = model.loss(blobs())
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    return model.eval()
+
+
+@torch.no_grad()
+def imagined_error(model, clip, action, observed=2):
+    latent = filtered(model, clip, observed)
+    for t in range(observed, clip.state.shape[1]):
+        latent = model.step(latent, action[:, t])
+    return model.error(latent, {"tokens": clip.percepts["tokens"][:, -1]}, clip.state[:, -1]).mean()
+
+
+def test_it_learns_to_obey_the_action():
+    model = learn()
+    clip = blobs(batch=128)
+    true = imagined_error(model, clip, clip.action)
+    assert imagined_error(model, clip, clip.action[torch.randperm(128)]) > 1.5 * true
+    copied = (clip.percepts["tokens"][:, 1] - clip.percepts["tokens"][:, -1]).square().mean()
+    assert true < 0.5 * copied
+
+
+def test_blind_control_sees_nothing():
+    model = build(blind=True).eval()
+    clip, other = random_clip(), random_clip()
+    other.state, other.action = clip.state, clip.action
+    with torch.no_grad():
+        seen, unseen = (model.features(filtered(model, c, 3)) for c in (clip, other))
+    torch.testing.assert_close(seen, unseen)
+    assert "loss_tokens" not in model.loss(clip)[2]
+
+
+# -- from configuration to filter ---
+
+
+def test_filter_is_trained_saved_and_loaded(token_root, tmp_path):
+    """From a token cache to a shielded action, by the commands' functions; the checkpoint holds no encoder."""
+    from safetensors import safe_open
+
+    from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+    from lerobot_latentsafe.training import train_margin, train_reachability
+
+    meta = tiny.metadata(token_root)
+    options = dict(world_model=tiny.dino_wm_config(), action_candidates=None, margin_clips=32)
+    stage_one = tiny.train_stage_one(meta, tmp_path / "one", **options)
+    train_margin(stage_one, meta, tmp_path / "two")
+    train_reachability(tmp_path / "two", meta, tmp_path / "three")
+    policy = LatentSafePolicy.from_pretrained(tmp_path / "three")
+    assert all(d.action.isfinite().all() and d.value.isfinite().all() for d in tiny.drive(policy))
+    with safe_open(tmp_path / "three" / "model.safetensors", "pt") as file:
+        names = list(file.keys())
+    assert not [name for name in names if "encoder" in name or "basis" in name]
+
+
+def test_the_papers_sizes_train_save_load_and_stream(tmp_path):
+    """With 4 patches instead of 256; scripts/bench_dino_wm.py measures them all."""
+    sizes = yaml.safe_load(PAPER.read_text())["policy"]["world_model"]
+    config = draccus.decode(WorldModelConfig, sizes)
+    model = DinoWM(config, KEYS, 14, 7, n_patches=4, token_dim=2 * 384).train()
+    assert (config.dim, config.depth, config.heads, config.history) == (788, 6, 16, 3)
+    clip = random_clip(batch=1, length=config.clip_length)
+    clip.percepts = {"tokens": torch.randn(1, config.clip_length, 4, 768)}
+    clip.state, clip.action = torch.randn(1, config.clip_length, 14), torch.rand(1, config.clip_length, 7)
+    loss, *_ = model.loss(clip)
+    loss.backward()
+    torch.optim.SGD(model.parameters(), 1e-3).step()
+    torch.save(model.state_dict(), tmp_path / "model.pt")
+    again = DinoWM(config, KEYS, 14, 7, n_patches=4, token_dim=2 * 384).eval()
+    again.load_state_dict(torch.load(tmp_path / "model.pt", weights_only=True))
+    with torch.no_grad():
+        assert_same(filtered(model.eval(), clip, 4), filtered(again, clip, 4))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"conditioning": "add"}, r"'add'.*adaln, concat"),
+        ({"clip_length": 1}, "clip_length is 1.*2 frames"),
+        ({"head_dim": 7}, "head_dim is 7.*even"),
+        ({"conditioning": "concat", "embedding": 16}, "dim is 32.*embedding=16"),
+    ],
+)
+def test_sizes_that_cannot_be_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        build(**options)
+
+
+def test_model_without_a_camera_is_refused():
+    with pytest.raises(ValueError, match="at least one camera"):
+        tiny.dino_wm_config().build([], STATE_DIM, ACTION_DIM)
+
+
+def test_model_made_for_tokens_cannot_see_images():
+    with pytest.raises(RuntimeError, match="build it from its configuration"):
+        build().perceive({key: torch.rand(1, 3, 32, 32) for key in KEYS})
