@@ -133,7 +133,7 @@ class DinoWM(EndAware):
         )
         self.state_decoder = _change_decoder(d + state_dim + action_dim, config.decoder_layers, state_dim)
         self.summary_in, self.summary_out = Linear(token_dim, width), Linear(width, width)
-        self.summary_position = nn.Parameter(0.02 * torch.randn(n_patches, width))
+        self.summary_position = nn.Parameter(torch.randn(n_patches, width))
         self.summary_norm = nn.LayerNorm(2 * width)
         self.feature_dim = 2 * width + d + state_dim
         self.continues = nn.Sequential(nn.Linear(self.feature_dim, 64), nn.SiLU(), nn.Linear(64, 1))
@@ -151,7 +151,8 @@ class DinoWM(EndAware):
             self.action_in = nn.Linear(self.action_dim, config.embedding)
             width = d - 2 * config.embedding
         self.token_in = nn.Identity() if width == token_dim else Linear(token_dim, width)
-        self.position = nn.Parameter(0.02 * torch.randn(n_patches, d))
+        # As large as the tokens: while patches are hard to tell apart, what an action moves is not learned.
+        self.position = nn.Parameter(torch.randn(n_patches, d))
 
     # -- the model ---
 
