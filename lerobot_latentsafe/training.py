@@ -14,6 +14,9 @@ from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, adopt_datas
 from lerobot_latentsafe.reachability import LatentReachability, Starts
 from lerobot_latentsafe.world_models.base import Latent, map_latent, select
 
+STARTS_BYTES = 2**30
+"""Memory for the latents that imagination starts from; those of a transformer hold keys and values and are large."""
+
 
 @torch.no_grad()
 def seen_and_imagined(
@@ -114,15 +117,17 @@ def encoded_starts(
 
     Args:
         generator: draws both the windows and the starts.
-        max_frames: frames encoded at most.
+        max_frames: frames encoded at most; fewer where their latents would not fit in `STARTS_BYTES`.
 
     Returns:
         A sampler of latents.
     """
+    latent_bytes = sum(t.nbytes for t in policy.world_model.initial(1).values())
+    max_frames = min(max_frames, STARTS_BYTES // (2 * latent_bytes))  # two latents of each
     n, length = len(reader.labels.failure), policy.config.world_model.clip_length
     offset = int(torch.randint(length, (1,), generator=generator))
     first = np.arange(offset, n, length)
-    first = first[torch.randperm(len(first), generator=generator)[: max_frames // length].numpy()]
+    first = first[torch.randperm(len(first), generator=generator)[: max(1, max_frames // length)].numpy()]
     single, filtered = [], []
     for chunk in np.array_split(first, max(1, len(first) // 64)):
         clip = reader.cut(chunk, policy)

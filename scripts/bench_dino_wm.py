@@ -19,9 +19,10 @@ Compact size (the default DinoWMConfig without its encoder), `--episodes` imagin
     authors_compact   their predictor, of the same width and depth, one episode after the other, as their planner does
 
 All in one process, in turn, on one thread, the first round thrown away; CPU time, user and system. Much of the time of
-large activations is page faults, which a setting of glibc's malloc avoids (`memory.py`). It is not part of how the authors
-run theirs, so the paper's size is timed without it, and then again with it for all (`*_kept_memory`); the compact size
-is timed with it for all. The authors' code is not part of this package. Clone https://github.com/gaoyuezhou/dino_wm yourself, pip install einops, and run
+large activations is page faults, which a setting of glibc's malloc avoids (`memory.py`). The authors do not make it, so
+the paper's size is timed without it, and then again with it for all (`*_kept_memory`); the compact size is timed with it
+for all. The authors' code is not part of this package. Clone https://github.com/gaoyuezhou/dino_wm yourself,
+pip install einops, and run
 
     OMP_NUM_THREADS=1 python scripts/bench_dino_wm.py --authors=PATH --json=results/bag/bench_dino_wm.json
 """

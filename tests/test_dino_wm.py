@@ -278,6 +278,18 @@ def test_filter_is_trained_saved_and_loaded(token_root, tmp_path):
     assert not [name for name in names if "encoder" in name or "basis" in name]
 
 
+def test_latents_that_imagination_starts_from_fit_in_memory(token_root, monkeypatch):
+    from lerobot_latentsafe import training
+
+    policy = tiny.new_policy(tiny.metadata(token_root), world_model=tiny.dino_wm_config(), action_candidates=None)
+    length, cut, windows = policy.config.world_model.clip_length, policy.reader.cut, []
+    monkeypatch.setattr(policy.reader, "cut", lambda first, policy: windows.extend(first) or cut(first, policy))
+    latent = sum(t.nbytes for t in policy.world_model.initial(1).values())
+    monkeypatch.setattr(training, "STARTS_BYTES", 2 * latent * 3 * length)
+    draw = training.encoded_starts(policy, policy.reader, torch.Generator())
+    assert len(windows) == 3 and len(draw(5)["tokens"]) == 5
+
+
 def test_the_papers_sizes_train_save_load_and_stream(tmp_path):
     """With 4 patches instead of 256; scripts/bench_dino_wm.py measures them all."""
     sizes = yaml.safe_load(PAPER.read_text())["policy"]["world_model"]
