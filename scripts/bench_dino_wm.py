@@ -20,8 +20,8 @@ Compact size (the default DinoWMConfig without its encoder), `--episodes` imagin
 
 All in one process, in turn, on one thread, the first round thrown away; CPU time, user and system. Much of the time of
 large activations is page faults, which a setting of glibc's malloc avoids (`memory.py`). The authors do not make it, so
-the paper's size is timed without it, and then again with it for all (`*_kept_memory`); the compact size is timed with it
-for all. The authors' code is not part of this package. Clone https://github.com/gaoyuezhou/dino_wm yourself,
+the paper's size is timed without it, and then again with it for all (`*_kept_memory`); the compact size is timed
+with it for all. The authors' code is not part of this package. Clone https://github.com/gaoyuezhou/dino_wm yourself,
 pip install einops, and run
 
     OMP_NUM_THREADS=1 python scripts/bench_dino_wm.py --authors=PATH --json=results/bag/bench_dino_wm.json
