@@ -15,9 +15,11 @@ REPOSITORY = Path(__file__).parents[1]
 # Run with the wheel's content first on the path: what a LeRobot command does before it parses its options.
 DISCOVER = """
 import json, sys
+import lerobot.configs.policies, lerobot.processor
 from lerobot.utils.import_utils import register_third_party_plugins
+before = set(sys.modules)  # with transformers installed, LeRobot loads it itself
 register_third_party_plugins()
-loaded = sorted(sys.modules)
+loaded = sorted(set(sys.modules) - before)
 import gymnasium
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
