@@ -9,6 +9,7 @@ from lerobot_latentsafe.envs.configuration_envs import LatentSafeBagEnv, LatentS
 from lerobot_latentsafe.perceive import PerceiveStep
 from lerobot_latentsafe.robots.franka.config_franka import LatentSafeFrankaConfig
 from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
+from lerobot_latentsafe.robots.shielded.config_shielded import LatentSafeShieldedConfig
 from lerobot_latentsafe.teleoperators.end_effector.config_end_effector import LatentSafeEndEffectorConfig
 from lerobot_latentsafe.teleoperators.scripted.config_scripted import LatentSafeScriptedConfig
 
@@ -21,6 +22,7 @@ __all__ = [
     "LatentSafeFrankaConfig",
     "LatentSafeFrankaMujocoConfig",
     "LatentSafeScriptedConfig",
+    "LatentSafeShieldedConfig",
     "PerceiveStep",
 ]
 __version__ = "0.1.0"

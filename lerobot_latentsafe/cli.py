@@ -18,6 +18,9 @@ VERBS: dict[str, tuple[str, str]] = {
     "push": ("Push", "push a filter, or a shielded policy, to the Hub with its card"),
     "eval-monitor": ("EvalMonitor", "compare a filter's verdicts with the exact safe set (Table 1)"),
     "eval-shield": ("EvalShield", "run a policy bare and shielded from the same starts"),
+    "record": ("recording.Record", "lerobot-record under a filter: the dataset stores what was executed"),
+    "teleoperate": ("recording.Teleoperate", "lerobot-teleoperate under a filter"),
+    "merge-decisions": ("MergeDecisions", "copy a recording with the shield's decisions as columns"),
     "label": ("Label", "open a local page on which a person marks where episodes fail"),
     "check-labels": ("CheckLabels", "list the labels that a trained filter disagrees with"),
     "auto-label": ("AutoLabel", "let a function or a vision-language model label the rest"),
@@ -25,7 +28,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "report": ("Report", "write one HTML file about a filter and what it changes"),
     "path": ("PathOf", "print the folder of a committed checkpoint, for LeRobot's commands"),
 }
-"""Verb -> its dataclass in `commands.py`, and what it is for."""
+"""Verb -> its dataclass, in `commands.py` unless a module is named, and what it is for."""
 
 INTRODUCTION = """Latent safety filters for LeRobot.
 
@@ -54,7 +57,8 @@ def main(argv: list[str] | None = None) -> None:
         sys.exit(f"latentsafe: unknown verb {verb!r}; expected one of {', '.join(VERBS)}")
     # torchcodec without system FFmpeg logs a page of traceback; LeRobot then falls back to pyav by itself.
     logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
-    command = getattr(importlib.import_module("lerobot_latentsafe.commands"), VERBS[verb][0])
+    module, _, name = VERBS[verb][0].rpartition(".")
+    command = getattr(importlib.import_module(f"lerobot_latentsafe.{module or 'commands'}"), name)
 
     import draccus
     from lerobot.utils.import_utils import register_third_party_plugins

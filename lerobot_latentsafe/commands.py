@@ -503,6 +503,24 @@ class AutoLabel:
 
 
 @dataclass
+class MergeDecisions:
+    """Copy a recording of `latentsafe record` with what the shield decided as columns `shield.*`, for LeRobot alone."""
+
+    output_dir: Path
+    new_repo_id: str
+    dataset: DatasetSource = field(default_factory=DatasetSource)
+
+    def run(self) -> None:
+        from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+        from lerobot_latentsafe.labeling.columns import write_decisions
+
+        dataset = LeRobotDataset(self.dataset.repo_id, root=self.dataset.root)
+        written = write_decisions(dataset, self.output_dir, self.new_repo_id)
+        print(f"{written.num_frames} frames with the shield's decisions in {self.output_dir}")
+
+
+@dataclass
 class WriteLabels:
     """Copy a dataset with its label files as columns, which LeRobot alone can read, and push it on request."""
 

@@ -6,6 +6,7 @@ and in range ever counts as safe.
 
 import logging
 import time
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -43,6 +44,7 @@ class Shield:
         self.latent: Latent | None = None
         self.executed: Tensor | None = None
         self.decision: FilterDecision | None = None
+        self.decided_at: float | None = None
 
     @torch.no_grad()
     def __call__(
@@ -75,12 +77,14 @@ class Shield:
         fallback = self._usable(action, here)
         # A margin that is negative now, or on the way, is a failure whatever comes after.
         value = torch.minimum(value, torch.minimum(margin, on_the_way))
-        if config.deadline_ms is not None and (self.clock() - started) * 1e3 > config.deadline_ms:
+        finished = self.clock()
+        if config.deadline_ms is not None and (finished - started) * 1e3 > config.deadline_ms:
             fault = _first_fault(fault, torch.ones_like(fault, dtype=torch.bool), Reason.DEADLINE_MISSED)
         decision = least_restrictive(
             proposed, fallback, value, margin, config.epsilon, fault, monitor=config.mode == "monitor"
         )
-        self.latent, self.decision = latent, decision
+        self.latent, self.decision, self.decided_at = latent, decision, finished
+        _active.add(self)
         self.executed = model.normalise_action(decision.action).nan_to_num(0.0).clamp(-1, 1)
         return decision
 
@@ -123,7 +127,7 @@ class Shield:
         everyone = torch.ones(batch_size, dtype=torch.bool, device=model.device)
         if proposed is None:
             fault = _first_fault(fault, everyone, without)
-            proposed = self._hold(batch_size)
+            proposed = self.hold(batch_size)
         proposed = proposed.to(model.device, torch.float32)
         expected = (batch_size, len(model.config.action_low))
         if tuple(proposed.shape) != expected:
@@ -164,14 +168,27 @@ class Shield:
     def _usable(self, action: Tensor, value: Tensor) -> Tensor:
         """The safety policy's action in robot units; where it or its value is not finite, hold."""
         finite = torch.isfinite(action).all(-1) & torch.isfinite(value)
-        return torch.where(finite[:, None], self.filter.denormalise_action(action), self._hold(len(action)))
+        return torch.where(finite[:, None], self.filter.denormalise_action(action), self.hold(len(action)))
 
-    def _hold(self, batch_size: int) -> Tensor:
+    def hold(self, batch_size: int) -> Tensor:
         """No motion, and the kept commands as they were, in robot units."""
         model, still = self.filter, self.filter.hold_action(batch_size)
         if self.executed is None:
             return still
         return torch.where(model.kept, model.denormalise_action(self.executed), still)
+
+
+_active: "weakref.WeakSet[Shield]" = weakref.WeakSet()
+
+
+def decided_elsewhere(shield: Shield, action: Tensor, within_s: float) -> bool:
+    """Whether another shield of this process decided on this very action (1, A) just now: it needs no second look."""
+    for other in _active - {shield}:
+        fresh = other.decided_at is not None and 0 <= other.clock() - other.decided_at <= within_s
+        acting = fresh and other.filter.config.mode == "filter"
+        if acting and torch.equal(other.decision.action.cpu(), action):
+            return True
+    return False
 
 
 def _first_fault(fault: Tensor, where: Tensor, reason: Reason) -> Tensor:

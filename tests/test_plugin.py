@@ -104,7 +104,7 @@ def test_lerobot_discovers_policy_env_and_world_model(discovered, installed):
     assert all(Path(file).is_relative_to(installed) for file in discovered["files"])  # not this repository's
     assert "latentsafe" in discovered["policies"]
     assert {"latentsafe_dubins", "latentsafe_bag", "latentsafe_blocks"} <= set(discovered["envs"])
-    assert {"latentsafe_franka", "latentsafe_franka_mujoco"} <= set(discovered["robots"])
+    assert {"latentsafe_franka", "latentsafe_franka_mujoco", "latentsafe_shielded"} <= set(discovered["robots"])
     assert {"latentsafe_scripted", "latentsafe_end_effector"} <= set(discovered["teleoperators"])
     assert "rssm" in discovered["world_models"]
     assert discovered["gym"] == [f"lerobot_latentsafe/{name}-v0" for name in ("Dubins", "Bag", "Blocks")]

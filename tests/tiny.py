@@ -115,6 +115,31 @@ def train_stage_one(meta, folder, steps=5, **changes):
     return folder
 
 
+def save_franka_filter(folder, scene="blocks", **changes):
+    """A filter of the simulated Franka's two cameras with random weights, saved as if it were trained."""
+    from lerobot.configs.types import FeatureType, PolicyFeature
+
+    from lerobot_latentsafe.envs.scenes import SCENES
+    from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+    from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, STATE_NAMES, action_limits
+    from lerobot_latentsafe.training import save_filter
+
+    torch.manual_seed(0)
+    cameras = [f"observation.images.{name}" for name in ("front", "wrist")]
+    low, high = action_limits(SCENES[scene].fps)
+    images = {key: PolicyFeature(FeatureType.VISUAL, (3, 32, 32)) for key in cameras}
+    options = dict(
+        action_candidates=None, cameras=cameras, fps=SCENES[scene].fps, stage="reachability",
+        input_features={**images, "observation.state": PolicyFeature(FeatureType.STATE, (len(STATE_NAMES),))},
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (len(ACTION_NAMES),))},
+        state_names=STATE_NAMES, action_names=ACTION_NAMES, kept_commands=["gripper.pos"], lookahead=0,
+        action_low=low.tolist(), action_high=high.tolist(), action_varies=[True] * len(ACTION_NAMES),
+        state_mean=[0.0] * len(STATE_NAMES), state_std=[1.0] * len(STATE_NAMES),
+    )  # fmt: skip
+    save_filter(LatentSafePolicy(config(**{**options, **changes})), Path(folder))
+    return folder
+
+
 def diffusion_config(action_dim=ACTION_DIM, **changes):
     from lerobot.configs.types import FeatureType, PolicyFeature
     from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig

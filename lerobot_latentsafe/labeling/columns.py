@@ -23,10 +23,7 @@ def write_columns(
         LabelFileError: a specification without a label file.
         FileExistsError: output_dir exists.
     """
-    from lerobot.datasets.dataset_tools import modify_features, remove_feature
-
-    if Path(output_dir).exists():
-        raise FileExistsError(f"{output_dir} exists; choose another --output_dir or delete it")
+    _refuse_existing(output_dir)
     frames, columns = read_frames(dataset.root, ["action"]), {}
     for name in specifications:
         path = sidecar_path(dataset.root, name)
@@ -34,6 +31,40 @@ def write_columns(
             known = ", ".join(specifications_of(dataset.root)) or "none; run latentsafe label first"
             raise LabelFileError(f"{dataset.repo_id} has no label file {name!r}; it has {known}")
         columns[name] = (Sidecar.read(path, frames).failure.astype("int64"), COLUMN)
+    return _with_columns(dataset, columns, output_dir, repo_id)
+
+
+def write_decisions(dataset: "LeRobotDataset", output_dir: str | Path, repo_id: str) -> "LeRobotDataset":
+    """A copy of a recording with the shield's decisions as columns `shield.proposed`, `.value`, `.margin`,
+    `.intervened` (0 or 1) and `.reason` (a `filter.Reason`).
+
+    Raises:
+        FileNotFoundError: it was not recorded by `latentsafe record`.
+        ValueError: the decisions belong to another dataset.
+        FileExistsError: output_dir exists.
+    """
+    from lerobot_latentsafe.robots.shielded.journal import FILE, decision_columns
+
+    _refuse_existing(output_dir)
+    frames = read_frames(dataset.root, ["frame_index"])
+    found = decision_columns(Path(dataset.root) / FILE, frames["episode_index"], frames["frame_index"])
+    columns = {}
+    for name, values in found.items():
+        names = dataset.meta.features["action"]["names"] if name == "proposed" else None
+        shape = values.shape[1:] or (1,)
+        columns[f"shield.{name}"] = (values, {"dtype": str(values.dtype), "shape": shape, "names": names})
+    return _with_columns(dataset, columns, output_dir, repo_id)
+
+
+def _refuse_existing(output_dir: str | Path) -> None:
+    if Path(output_dir).exists():
+        raise FileExistsError(f"{output_dir} exists; choose another --output_dir or delete it")
+
+
+def _with_columns(dataset: "LeRobotDataset", columns: dict, output_dir: str | Path, repo_id: str) -> "LeRobotDataset":
+    """A copy of a dataset with these columns, each (values, feature); one of the same name is replaced."""
+    from lerobot.datasets.dataset_tools import modify_features, remove_feature
+
     replaced = [name for name in columns if name in dataset.meta.features]
     if not replaced:
         return modify_features(dataset, columns, output_dir=output_dir, repo_id=repo_id)

@@ -1,7 +1,5 @@
 """The simulated Franka as a LeRobot robot."""
 
-import logging
-import re
 from functools import cached_property
 
 import numpy as np
@@ -9,6 +7,7 @@ from lerobot.robots.robot import Robot
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
 from lerobot_latentsafe.envs.scenes import SCENES, make_scene
+from lerobot_latentsafe.robots.announcements import Announcements
 from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, GRIPPER_NAME, JOINT_NAMES, STATE_NAMES, read_action
 from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
 
@@ -36,7 +35,7 @@ class LatentSafeFrankaMujoco(Robot):
         self.cameras = dict.fromkeys(CAMERAS)
         self.scene = None
         self.episode = 0
-        self._listener = _Listener()
+        self._announcements = Announcements()
 
     @cached_property
     def observation_features(self) -> dict:
@@ -69,7 +68,7 @@ class LatentSafeFrankaMujoco(Robot):
         scene.render(CAMERAS[0])  # fails here, not in the middle of an episode, where nothing can draw
         self.scene = scene
         self.episode += 1
-        logging.getLogger().addHandler(self._listener)
+        self._announcements.listen()
         _connected.append(self)
 
     def reset(self, seed: int) -> None:
@@ -80,8 +79,8 @@ class LatentSafeFrankaMujoco(Robot):
 
     def get_observation(self) -> dict:
         self._require_connection()
-        announced = self._listener.take()
-        if announced is not None:
+        announced = self._announcements.take()
+        if isinstance(announced, int):
             self.reset(self.config.seed + announced)
         state = dict(zip(STATE_NAMES, self.scene.proprioception().tolist()))
         return {**state, **{camera: self.scene.render(camera) for camera in CAMERAS}}
@@ -110,7 +109,7 @@ class LatentSafeFrankaMujoco(Robot):
 
     def disconnect(self) -> None:
         self._require_connection()
-        logging.getLogger().removeHandler(self._listener)
+        self._announcements.stop()
         _connected.remove(self)
         self.scene.close()
         self.scene = None
@@ -135,23 +134,3 @@ def connected_simulation() -> LatentSafeFrankaMujoco:
             "use them with --robot.type=latentsafe_franka_mujoco"
         )
     return _connected[-1]
-
-
-class _Listener(logging.Handler):
-    """Hears lerobot-record announce an episode (`log_say`)."""
-
-    announcement = re.compile(r"Recording episode (\d+)$")
-
-    def __init__(self):
-        super().__init__(logging.INFO)
-        self._episode: int | None = None
-
-    def emit(self, record: logging.LogRecord) -> None:
-        heard = self.announcement.match(record.getMessage())
-        if heard:
-            self._episode = int(heard[1])
-
-    def take(self) -> int | None:
-        """The episode announced since the last call."""
-        episode, self._episode = self._episode, None
-        return episode

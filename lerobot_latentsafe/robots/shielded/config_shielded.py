@@ -1,0 +1,61 @@
+"""Options of a shielded robot."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import draccus
+from lerobot.robots.config import RobotConfig
+
+NAME = "latentsafe_shielded"
+
+
+@dataclass
+class InnerRobotConfig(draccus.ChoiceRegistry):
+    """Any registered robot but the shielded one: a registry must not nest itself, draccus would recurse."""
+
+    @classmethod
+    def get_known_choices(cls) -> dict[str, type]:
+        return {name: kind for name, kind in RobotConfig.get_known_choices().items() if name != NAME}
+
+    @classmethod
+    def get_choice_class(cls, name: str) -> type:
+        return cls.get_known_choices()[name]
+
+    @classmethod
+    def get_choice_name(cls, subcls: type) -> str:
+        return RobotConfig.get_choice_name(subcls)
+
+
+@RobotConfig.register_subclass(NAME)
+@dataclass(kw_only=True)
+class LatentSafeShieldedConfig(RobotConfig):
+    """Any robot behind a latent safety filter: `--robot.inner.type=... --robot.filter=...`.
+
+    Attributes:
+        inner: the robot that moves.
+        filter: a trained filter: a folder, a Hub id or the name of a committed one.
+        mode: `filter` or `monitor`, which only reports; None takes the filter's.
+        epsilon, guard: of the filter law; None takes the filter's.
+        device: where the filter runs; None takes the filter's.
+        unfiltered_moves: let commands pass that the filter knows nothing of, such as the joint moves by which LeRobot
+            returns an arm to where it started. Otherwise the robot holds still instead.
+        journal: a parquet file for every decision of a recording; `latentsafe record` sets it.
+    """
+
+    inner: InnerRobotConfig | None = None
+    filter: str | None = None
+    mode: str | None = None
+    epsilon: float | None = None
+    guard: int | None = None
+    device: str | None = None
+    unfiltered_moves: bool = False
+    journal: Path | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.inner is None:
+            raise ValueError("no robot to shield: give --robot.inner.type=<any LeRobot robot>")
+        if self.filter is None:
+            raise ValueError("no filter: give --robot.filter=<folder, Hub id or committed name>")
+        if isinstance(self.inner, LatentSafeShieldedConfig):
+            raise ValueError("--robot.inner is itself latentsafe_shielded; shields do not nest, give the bare robot")

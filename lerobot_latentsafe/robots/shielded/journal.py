@@ -1,0 +1,119 @@
+"""What a shield decided, frame by frame, beside the recording."""
+
+import logging
+from pathlib import Path
+
+import numpy as np
+
+from lerobot_latentsafe.filter import FilterDecision, Reason
+from lerobot_latentsafe.robots.announcements import RESETTING
+
+logger = logging.getLogger(__name__)
+
+FILE = Path("shield") / "decisions.parquet"
+"""Where a recording's decisions are, in its dataset's folder."""
+
+
+class Journal:
+    """Rows of decisions by episode and frame, written to a parquet file after every episode.
+
+    Columns: episode_index, frame_index, proposed (list of float, robot units), value, margin, intervened, reason (the
+    name of a `Reason`). Frames count from 0 in each episode; the pauses between episodes leave no rows.
+    """
+
+    def __init__(self, path: Path):
+        self.path = Path(path)
+        self.episodes: dict[int, list[dict]] = {}
+        self.episode: int | None = 0
+        if self.path.exists():  # a recording that goes on
+            for row in _read(self.path).to_pylist():
+                self.episodes.setdefault(row["episode_index"], []).append(row)
+            self.episode = max(self.episodes, default=-1) + 1
+
+    def hear(self, announced: int | str) -> None:
+        """Begin an episode, anew if it was begun before, or end one."""
+        self.write()
+        self.episode = None if announced == RESETTING else announced
+        if self.episode is not None:
+            self.episodes[self.episode] = []
+
+    def add(self, decision: FilterDecision) -> None:
+        """Note the decision on the next frame (batch of one)."""
+        if self.episode is None:
+            return
+        rows = self.episodes.setdefault(self.episode, [])
+        rows.append(
+            {
+                "episode_index": self.episode,
+                "frame_index": len(rows),
+                "proposed": decision.proposed[0].tolist(),
+                "value": decision.value.item(),
+                "margin": decision.margin.item(),
+                "intervened": bool(decision.intervened.item()),
+                "reason": Reason(int(decision.reason.item())).name.lower(),
+            }
+        )
+
+    def write(self) -> None:
+        """Replace the file at once by what is known; a failure to write is logged, for the robot must go on."""
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        rows = [row for _, episode in sorted(self.episodes.items()) for row in episode]
+        if not rows:
+            return
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            unfinished = self.path.with_suffix(".tmp")
+            pq.write_table(pa.Table.from_pylist(rows), unfinished)
+            unfinished.replace(self.path)
+        except OSError as e:
+            logger.error("decisions were not written to %s (%s); they are kept and tried again", self.path, e)
+
+
+def _read(path: Path):
+    """The table of a journal.
+
+    Raises:
+        ValueError: torn, or not a journal.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        return pq.read_table(path)
+    except (pa.ArrowInvalid, OSError) as e:
+        raise ValueError(f"{path} is not a readable journal of decisions ({e}); move it away") from e
+
+
+def decision_columns(path: Path, episode: np.ndarray, frame: np.ndarray) -> dict[str, np.ndarray]:
+    """A journal's columns for the frames of a dataset, in their order.
+
+    Args:
+        episode, frame: (N,) the indices of the dataset's frames.
+
+    Returns:
+        proposed (N, A) and value, margin (N,) float32; intervened, reason (N,) int64.
+
+    Raises:
+        ValueError: the journal lacks a frame: it belongs to another dataset.
+        FileNotFoundError: there is no journal.
+    """
+    if not Path(path).exists():
+        raise FileNotFoundError(f"{path} does not exist; record with `latentsafe record` to get one")
+    rows = {(row["episode_index"], row["frame_index"]): row for row in _read(path).to_pylist()}
+    wanted = list(zip(episode.tolist(), frame.tolist()))
+    missing = [key for key in wanted if key not in rows]
+    if missing:
+        raise ValueError(
+            f"{path} holds no decision for episode {missing[0][0]}, frame {missing[0][1]} and {len(missing) - 1} more "
+            "frames; it belongs to another dataset"
+        )
+    found = [rows[key] for key in wanted]
+    return {
+        "proposed": np.array([row["proposed"] for row in found], np.float32),
+        "value": np.array([row["value"] for row in found], np.float32),
+        "margin": np.array([row["margin"] for row in found], np.float32),
+        "intervened": np.array([row["intervened"] for row in found], np.int64),
+        "reason": np.array([Reason[row["reason"].upper()] for row in found], np.int64),
+    }
