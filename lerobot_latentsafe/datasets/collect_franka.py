@@ -55,6 +55,7 @@ class Source:
 SOURCES: dict[str, Source] = {
     "bag_mix": Source("bag", {"random": 1000, "open_end": 75, "middle": 75, "closed_end": 100, "side_to_side": 50}),
     "bag_branches": Source("bag", {"branch": 500}, branches=5),
+    "bag_climbs": Source("bag", {"climb": 200}, branches=4, grasps=(0.5, 0.1, 0.4)),
     "bag_lifts": Source("bag", {"rise": 200}, branches=1, grasps=(0.5, 0.0, 0.5)),
     "bag_strong": Source("bag", {"middle": 100}),
     "bag_weak": Source("bag", {"closed_end": 100}, variant="sealed"),

@@ -128,6 +128,19 @@ def branch(scene: bag.BagScene, speed: float, rng: np.random.Generator) -> Actio
         yield from wander(scene, speed, rng)
 
 
+def climb(scene: bag.BagScene, speed: float, rng: np.random.Generator) -> Actions:
+    """From a grasped bag, up in steps, with pauses and steps back: as an operator who is overridden on the way."""
+    start = scene.controller.position
+    height = rng.uniform(0.03, 0.12)
+    while True:
+        yield from reach(scene, start + up(height), speed, CLOSED)
+        yield from hold(CLOSED, int(rng.exponential(6)))
+        if rng.random() < 0.25:
+            height = max(0.0, height - rng.uniform(0.01, 0.06))
+            yield from reach(scene, start + up(height), MAX_SPEED, CLOSED)
+        height = min(0.28, height + rng.uniform(0.01, 0.04))
+
+
 def rise(scene: bag.BagScene, speed: float) -> Actions:
     """From a grasped bag, the same lift always: what follows differs by where the bag is held alone."""
     yield from reach(scene, scene.controller.position + up(0.20), speed, CLOSED)
@@ -174,6 +187,7 @@ BAG: dict[str, tuple[Callable[..., Actions], tuple[float, float]]] = {
     "closed_end": (lambda scene, speed, rng: lift(scene, bag.TAIL, speed, rng), (0.15, MAX_SPEED)),
     "side_to_side": (lambda scene, speed, rng: swing(scene, bag.TAIL, speed, rng), (0.08, MAX_SPEED)),
     "branch": (branch, (0.05, MAX_SPEED)),
+    "climb": (climb, (0.10, MAX_SPEED)),
     "rise": (lambda scene, speed, rng: rise(scene, speed), (0.25, 0.25)),
     "random": (fumble, (0.2, MAX_SPEED)),
 }

@@ -10,6 +10,7 @@ BEHAVIORS = {
     "closed_end": "yank the bag up by its closed end, so that candies spill",
     "side_to_side": "hold the bag by its closed end and swing it; --teleop.speed decides what happens",
     "branch": "from a bag already grasped: lift, lift and lower, up and down, sideways, Gaussian, or hold",
+    "climb": "from a bag already grasped: up in steps, with pauses and steps back",
     "rise": "from a bag already grasped: the same lift always",
     "random": "Gaussian actions, around the bag from a random grasp, around the blocks from above",
     "pluck_careful": "pull the green block straight up",
