@@ -21,6 +21,7 @@ class Reason(IntEnum):
     DEADLINE_MISSED = 8
     BASE_POLICY_FAILED = 9
     NO_BASE_POLICY = 10
+    WRONG_RATE = 11
 
 
 @dataclass

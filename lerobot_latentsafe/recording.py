@@ -20,10 +20,10 @@ from lerobot_latentsafe.robots.shielded.shielded import connected_shield
 
 @dataclass
 class ShieldStep(RobotActionProcessorStep):
-    """The operator's action becomes the executed one before LeRobot stores it."""
+    """The operator's action is executed here already, for what this step returns is what LeRobot stores."""
 
     def action(self, action: dict[str, float]) -> dict[str, float]:
-        return dict(connected_shield().decide(action))
+        return connected_shield().send_early(action)
 
     def transform_features(self, features: dict) -> dict:
         return features
@@ -47,7 +47,7 @@ class Record(RecordConfig):
             dataset.no_stamp = True
         journal = Path(dataset.root or HF_LEROBOT_HOME / dataset.repo_id) / FILE
         config = _lerobots(self, RecordConfig)
-        config.robot = _shielded(self.robot, self.filter, journal=journal)
+        config.robot = _shielded(self.robot, self.filter, fps=dataset.fps, journal=journal)
         step = RobotProcessorPipeline(
             [ShieldStep()],
             to_transition=robot_action_observation_to_transition,
@@ -66,7 +66,7 @@ class Teleoperate(TeleoperateConfig):
 
     def run(self) -> None:
         config = _lerobots(self, TeleoperateConfig)
-        config.robot = _shielded(self.robot, self.filter)
+        config.robot = _shielded(self.robot, self.filter, fps=self.fps)
         teleoperate(config)
 
 

@@ -15,6 +15,7 @@ import torch
 from safetensors import SafetensorError
 from torch import Tensor
 
+from lerobot_latentsafe.checkpoint import TRAINED
 from lerobot_latentsafe.filter import FilterDecision, Reason, least_restrictive
 from lerobot_latentsafe.world_models.base import Latent, replace_rows
 
@@ -37,7 +38,9 @@ class Shield:
 
     def __init__(self, filter: "LatentSafePolicy", clock: Callable[[], float] = time.perf_counter):
         self.filter, self.clock = filter, clock
+        self._twins: weakref.WeakKeyDictionary[Shield, bool] = weakref.WeakKeyDictionary()
         self.reset()
+        _shields.add(self)
 
     def reset(self) -> None:
         """Forget the history: call at the start of every episode."""
@@ -53,14 +56,16 @@ class Shield:
         proposed: Tensor | None,
         age_s: float = 0.0,
         without: Reason = Reason.BASE_POLICY_FAILED,
+        known: Reason = Reason.PASSED,
     ) -> FilterDecision:
         """Decide on one proposed action.
 
         Args:
             observation: LeRobot batch: images (B, C, H, W) in [0, 1], observation.state (B, S) in robot units.
             proposed: (B, A) in robot units, or None if there is none.
-            without: the reason to give where there is none.
             age_s: how old the observation is, seconds; older than one period of the filter's fps is stale.
+            without: the reason to give where there is none.
+            known: a fault that the caller has found, if any.
 
         Returns:
             The decision, also kept as `self.decision`.
@@ -69,6 +74,7 @@ class Shield:
         model, config = self.filter, self.filter.config
         images, state, fault = self._check_observation(observation, age_s)
         fault, proposed, inputs = self._check_action(proposed, fault, len(state), without)
+        fault = _first_fault(fault, torch.ones_like(fault, dtype=torch.bool), known)
         latent = self._filter_history(images, state, inputs, fault)
         margin = model.imagination.margin(latent)
         predicted, on_the_way = self._go_on(latent, inputs)
@@ -84,9 +90,38 @@ class Shield:
             proposed, fallback, value, margin, config.epsilon, fault, monitor=config.mode == "monitor"
         )
         self.latent, self.decision, self.decided_at = latent, decision, finished
-        _active.add(self)
         self.executed = model.normalise_action(decision.action).nan_to_num(0.0).clamp(-1, 1)
         return decision
+
+    def adopt(self, action: Tensor, within_s: float) -> bool:
+        """Take over the decision, and the memory, of another shield of this process that just let this action through.
+
+        It must be the same filter under a law no laxer than ours: deciding again would only repeat it.
+
+        Args:
+            action: (1, A) in robot units.
+            within_s: how long ago that decision may be, seconds.
+        """
+        for other in _shields - {self}:
+            fresh = other.decided_at is not None and 0 <= other.clock() - other.decided_at <= within_s
+            if fresh and torch.equal(other.decision.action.cpu(), action) and self._no_stricter_than(other):
+                self.latent, self.executed = other.latent, other.executed
+                self.decision, self.decided_at = other.decision, other.decided_at
+                return True
+        return False
+
+    def _no_stricter_than(self, other: "Shield") -> bool:
+        """Whether the other has our weights, acts, and passes nothing that we would not."""
+        own, theirs = self.filter.config, other.filter.config
+        same = all(getattr(own, name) == getattr(theirs, name) for name in (*TRAINED, "law", "lookahead", "guard"))
+        if not same or theirs.mode == "monitor" or theirs.epsilon < own.epsilon:
+            return False
+        if other not in self._twins:  # weights are compared once
+            ours, its = self.filter.state_dict(), other.filter.state_dict()
+            self._twins[other] = ours.keys() == its.keys() and all(
+                ours[key].device == its[key].device and torch.equal(ours[key], its[key]) for key in ours
+            )
+        return self._twins[other]
 
     def _check_observation(
         self, observation: dict[str, Tensor], age_s: float
@@ -127,7 +162,7 @@ class Shield:
         everyone = torch.ones(batch_size, dtype=torch.bool, device=model.device)
         if proposed is None:
             fault = _first_fault(fault, everyone, without)
-            proposed = self.hold(batch_size)
+            proposed = self._hold(batch_size)
         proposed = proposed.to(model.device, torch.float32)
         expected = (batch_size, len(model.config.action_low))
         if tuple(proposed.shape) != expected:
@@ -168,9 +203,9 @@ class Shield:
     def _usable(self, action: Tensor, value: Tensor) -> Tensor:
         """The safety policy's action in robot units; where it or its value is not finite, hold."""
         finite = torch.isfinite(action).all(-1) & torch.isfinite(value)
-        return torch.where(finite[:, None], self.filter.denormalise_action(action), self.hold(len(action)))
+        return torch.where(finite[:, None], self.filter.denormalise_action(action), self._hold(len(action)))
 
-    def hold(self, batch_size: int) -> Tensor:
+    def _hold(self, batch_size: int) -> Tensor:
         """No motion, and the kept commands as they were, in robot units."""
         model, still = self.filter, self.filter.hold_action(batch_size)
         if self.executed is None:
@@ -178,17 +213,7 @@ class Shield:
         return torch.where(model.kept, model.denormalise_action(self.executed), still)
 
 
-_active: "weakref.WeakSet[Shield]" = weakref.WeakSet()
-
-
-def decided_elsewhere(shield: Shield, action: Tensor, within_s: float) -> bool:
-    """Whether another shield of this process decided on this very action (1, A) just now: it needs no second look."""
-    for other in _active - {shield}:
-        fresh = other.decided_at is not None and 0 <= other.clock() - other.decided_at <= within_s
-        acting = fresh and other.filter.config.mode == "filter"
-        if acting and torch.equal(other.decision.action.cpu(), action):
-            return True
-    return False
+_shields: "weakref.WeakSet[Shield]" = weakref.WeakSet()
 
 
 def _first_fault(fault: Tensor, where: Tensor, reason: Reason) -> Tensor:

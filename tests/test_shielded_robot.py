@@ -6,12 +6,13 @@ import time
 import numpy as np
 import pytest
 import tiny
+import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.robots.utils import make_robot_from_config
 
 from lerobot_latentsafe import cli
 from lerobot_latentsafe.filter import Reason
-from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES
+from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, STATE_NAMES
 from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
 from lerobot_latentsafe.robots.shielded.config_shielded import LatentSafeShieldedConfig
 
@@ -137,26 +138,106 @@ def test_joint_moves_are_held_back_unless_allowed(trained, caplog):
         assert set(robot.send_action(joints)) == set(joints)
 
 
-def test_a_shielded_policy_is_not_filtered_twice(robot, trained, caplog):
+def test_what_stays_closed_stays_closed_through_moves_of_other_names(robot):
+    robot.get_observation()
+    robot.send_action(PUSH | {"gripper.pos": 0.25})
+    joints = {name: value for name, value in robot.get_observation().items() if name.startswith("joint_")}
+    for _ in range(3):
+        sent = robot.send_action(joints)
+        assert sent == pytest.approx(STILL | {"gripper.pos": 0.25})
+
+
+@pytest.mark.parametrize(
+    "announcement", ["Reset the environment", "Returning robot to initial position before shutdown"]
+)
+def test_moves_between_episodes_are_filtered_unless_allowed(trained, caplog, announcement):
+    """LeRobot returns an arm that acts in joint positions by commands of the usual names."""
+    for unfiltered in (False, True):
+        with (
+            caplog.at_level(logging.INFO),
+            make_robot_from_config(config(trained, epsilon=ALWAYS, unfiltered_moves=unfiltered)) as robot,
+        ):
+            logging.info("Recording episode 4")
+            robot.get_observation()
+            assert robot.send_action(PUSH) != pytest.approx(PUSH)
+            logging.info(announcement)
+            robot.get_observation()
+            assert (robot.send_action(PUSH) == pytest.approx(PUSH)) == unfiltered
+            assert ("does not filter now" in caplog.text) == unfiltered
+            broken = robot.send_action(PUSH | {"delta_x.pos": float("inf")})
+            assert np.isfinite(list(broken.values())).all()
+            logging.info("Recording episode 5")
+            robot.get_observation()
+            assert robot.send_action(PUSH) != pytest.approx(PUSH)
+
+
+def test_a_loop_far_faster_than_the_filter_is_not_trusted(robot, caplog):
+    for _ in range(12):
+        robot.get_observation()
+        robot.send_action(STILL)
+    assert last(robot).reason.item() == Reason.WRONG_RATE and "--fps=20" in caplog.text
+
+
+def test_a_robot_that_fails_fails_aloud_and_is_seen_anew(robot, monkeypatch):
+    robot.get_observation()
+
+    def fail(*_):
+        raise ConnectionError("no answer from the arm")
+
+    with monkeypatch.context() as m:
+        m.setattr(robot.inner, "send_action", fail)
+        with pytest.raises(ConnectionError):
+            robot.send_action(PUSH)
+        m.setattr(robot.inner, "get_observation", fail)
+        with pytest.raises(ConnectionError):  # never decides on what it saw before
+            robot.send_action(PUSH)
+    assert robot.send_action(PUSH) == pytest.approx(PUSH)
+
+
+def policy_decision(robot, trained):
+    """A policy under the same filter acts on what the robot sees: the policy and its action, as LeRobot sends it."""
     from lerobot.policies.utils import prepare_observation_for_inference
 
     from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 
     policy = LatentSafePolicy.from_pretrained(trained).eval()
-    robot.filter.config.epsilon = ALWAYS
-    seen = robot.get_observation()
-    batch = prepare_observation_for_inference(robot._frame(), policy.device)
-    action = dict(zip(ACTION_NAMES, policy.select_action(batch)[0].tolist()))
-    with caplog.at_level(logging.WARNING):
-        assert robot.send_action(action) == pytest.approx(action, abs=1e-6)
-    assert "not filtered again" in caplog.text and seen
-    robot.send_action(PUSH)  # what did not come from there is
-    assert last(robot).intervened.item()
+    policy.config.epsilon = robot.filter.config.epsilon
+    robot.get_observation()
+    with torch.inference_mode():
+        action = policy.select_action(prepare_observation_for_inference(robot._frame(), policy.device))
+    return policy, dict(zip(ACTION_NAMES, action[0].tolist()))
 
 
-def test_shields_do_not_nest(trained):
+def test_a_shielded_policy_is_not_filtered_twice(robot, trained, caplog):
+    policy, action = policy_decision(robot, trained)
+    assert robot.send_action(action) == pytest.approx(action)
+    assert "not filtered again" in caplog.text and last(robot) is policy.shield.decision
+    robot.get_observation()
+    robot.send_action(PUSH)  # what did not come from there is, on the same memory
+    assert last(robot) is not policy.shield.decision and last(robot).reason.item() == Reason.PASSED
+
+
+@pytest.mark.parametrize("difference", ["laxer", "other weights", "monitor"])
+def test_another_filter_of_the_policy_does_not_excuse_the_robots(robot, trained, difference):
+    policy, action = policy_decision(robot, trained)
+    if difference == "laxer":
+        robot.filter.config.epsilon = ALWAYS
+    elif difference == "monitor":
+        policy.config.mode = "monitor"
+    else:
+        next(policy.margin.parameters()).data.add_(1)
+    robot.send_action(action)
+    assert last(robot) is not policy.shield.decision
+
+
+def test_shields_do_not_nest(trained, capsys):
     with pytest.raises(ValueError, match="nest"):
         LatentSafeShieldedConfig(inner=config(trained), filter=str(trained))
+    nested = ["--robot.inner.type=latentsafe_shielded", "--robot.inner.inner.type=latentsafe_franka_mujoco"]
+    shielded = ["--robot.type=latentsafe_shielded", f"--robot.filter={trained}", "--teleop.type=latentsafe_scripted"]
+    with pytest.raises(SystemExit):
+        cli.main(["teleoperate", *shielded, *nested])
+    assert "invalid choice: 'latentsafe_shielded'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -164,6 +245,7 @@ def test_shields_do_not_nest(trained):
     [
         ({"cameras": ["observation.images.front", "observation.images.side"]}, "no camera side"),
         ({"action_names": [*ACTION_NAMES[:-1], "hand.pos"], "kept_commands": []}, "acts in"),
+        ({"state_names": [*STATE_NAMES[:-1], "weight.pos"]}, "does not observe weight.pos"),
     ],
 )
 def test_a_filter_of_another_robot_is_refused_before_anything_moves(tmp_path, changes, words):
@@ -173,7 +255,7 @@ def test_a_filter_of_another_robot_is_refused_before_anything_moves(tmp_path, ch
         image = PolicyFeature(FeatureType.VISUAL, (3, 32, 32))
         changes["input_features"] = {
             **dict.fromkeys(changes["cameras"], image),
-            "observation.state": PolicyFeature(FeatureType.STATE, (15,)),
+            "observation.state": PolicyFeature(FeatureType.STATE, (len(STATE_NAMES),)),
         }
     other = tiny.save_franka_filter(tmp_path / "other", **changes)
     with pytest.raises(ValueError, match=words):
@@ -233,12 +315,10 @@ def test_lerobots_own_commands_take_the_shielded_robot(trained, tmp_path, monkey
     lerobot_record.main()
     journal = tmp_path / "replay.parquet"
     replayed = {
-        "robot.type": "latentsafe_shielded", "robot.filter": trained, "robot.epsilon": ALWAYS, "robot.journal": journal,
-        "robot.inner.type": "latentsafe_franka_mujoco", "robot.inner.scene": "blocks", "robot.inner.image_size": 32,
-        "robot.inner.seed": 3, "dataset.repo_id": "me/shielded", "dataset.root": root, "dataset.episode": 0,
+        "robot.journal": journal, "dataset.repo_id": "me/shielded", "dataset.root": root, "dataset.episode": 0,
         "play_sounds": "false",
     }  # fmt: skip
-    monkeypatch.setattr("sys.argv", ["lerobot-replay", *(f"--{name}={value}" for name, value in replayed.items())])
+    monkeypatch.setattr("sys.argv", ["lerobot-replay", *shielded_options(trained, **replayed)])
     lerobot_replay.main()
     from lerobot_latentsafe.robots.shielded.journal import decision_columns
 
@@ -260,15 +340,97 @@ def test_decisions_of_another_dataset_are_refused(tmp_path):
         decision_columns(torn, np.zeros(1, int), np.zeros(1, int))
 
 
-def test_teleoperation_is_shielded(trained, tmp_path, monkeypatch):
-    from lerobot_latentsafe.robots.shielded import shielded
+@pytest.fixture
+def executed(monkeypatch):
+    """Every (proposed, executed) pair of actions in LeRobot's own loops."""
+    from lerobot_latentsafe.robots.shielded.shielded import LatentSafeShielded
 
-    sent, inner_send = [], shielded.LatentSafeShielded.send_action
+    pairs, send = [], LatentSafeShielded.send_action
+
+    def noted(self, action):
+        pairs.append((dict(action), send(self, action)))
+        return pairs[-1][1]
+
+    monkeypatch.setattr(LatentSafeShielded, "send_action", noted)
+    return pairs
+
+
+def shielded_options(trained, **more):
+    given = {
+        "robot.type": "latentsafe_shielded", "robot.filter": trained, "robot.epsilon": ALWAYS,
+        "robot.inner.type": "latentsafe_franka_mujoco", "robot.inner.scene": "blocks", "robot.inner.image_size": 32,
+        "robot.inner.seed": 3, **more,
+    }  # fmt: skip
+    return [f"--{name}={value}" for name, value in given.items()]
+
+
+OPERATOR = {"teleop.type": "latentsafe_scripted", "teleop.behavior": "pluck_careful", "fps": 20, "teleop_time_s": 0.5}
+
+
+def test_teleoperation_is_shielded(trained, monkeypatch, executed):
+    from lerobot.scripts import lerobot_teleoperate
+
+    monkeypatch.setattr("sys.argv", ["lerobot-teleoperate", *shielded_options(trained, **OPERATOR)])
+    lerobot_teleoperate.main()
+    assert len(executed) > 2 and all(sent != proposed for proposed, sent in executed)
+    executed.clear()
+    cli.main(["teleoperate", *shielded_options(trained, **OPERATOR | {"robot.epsilon": NEVER})])
+    assert len(executed) > 2 and all(sent == pytest.approx(proposed) for proposed, sent in executed)
+
+
+@pytest.mark.parametrize(("epsilon", "once"), [(None, True), (ALWAYS, False)])
+def test_a_rollout_is_shielded_once(trained, monkeypatch, executed, epsilon, once):
+    """By the policy's own filter if that is the robot's too; its return to the start is held back."""
+    from lerobot.rollout.strategies.core import RolloutStrategy
+    from lerobot.scripts import lerobot_rollout
+
+    from lerobot_latentsafe.shield import Shield
+
+    adopted, adopt, back = [], Shield.adopt, RolloutStrategy._return_to_initial_position
+    monkeypatch.setattr(Shield, "adopt", lambda *given: adopted.append(adopt(*given)) or adopted[-1])
+    monkeypatch.setattr(RolloutStrategy, "_return_to_initial_position", lambda self, hw: back(hw, duration_s=0.1))
+    given = {"policy.path": trained, "policy.device": "cpu", "task": "pluck", "fps": 20, "duration": 0.5}
+    given = [option for option in shielded_options(trained, **given) if epsilon or "epsilon" not in option]
+    monkeypatch.setattr("sys.argv", ["lerobot-rollout", *given])
+    lerobot_rollout.main()
+    assert len(adopted) > 2 and all(taken == once for taken in adopted)
+    assert all(set(sent) == set(ACTION_NAMES) for _, sent in executed)
+    returning = [sent for proposed, sent in executed if set(proposed) != set(ACTION_NAMES)]
+    assert returning and all(sent[name] == 0.0 for sent in returning for name in ACTION_NAMES[:6])
+
+
+def test_live_values_are_displayed(trained, monkeypatch):
+    """What LeRobot hands to its viewer, which need not be installed here."""
+    from lerobot.scripts import lerobot_teleoperate
+
+    seen = []
+    monkeypatch.setattr(lerobot_teleoperate, "init_visualization", lambda *a, **k: None)
+    monkeypatch.setattr(lerobot_teleoperate, "shutdown_visualization", lambda *a, **k: None)
     monkeypatch.setattr(
-        shielded.LatentSafeShielded, "send_action", lambda self, a: sent.append(inner_send(self, a)) or sent[-1]
+        lerobot_teleoperate, "log_visualization_data", lambda *a, observation, **k: seen.append(observation)
     )
-    cli.main(["teleoperate", *options(trained, tmp_path), "--fps=20", "--teleop_time_s=0.5"])
-    assert len(sent) > 2
+    cli.main(["teleoperate", *shielded_options(trained, **OPERATOR, display_data="true")])
+    assert all(np.isfinite(o["shield.value"]) and o["shield.intervened"] == 1.0 for o in seen[1:]) and len(seen) > 2
+
+
+def test_what_the_robot_clips_is_stored_clipped_and_sent_once(robot, monkeypatch):
+    sent, half = [], lambda action: {name: value / 2 for name, value in action.items()}
+    monkeypatch.setattr(robot.inner, "send_action", lambda action: sent.append(action) or half(action))
+    for _ in range(2):
+        robot.get_observation()
+        stored = robot.send_early(PUSH)
+        assert stored == half(PUSH) and robot.send_action(stored) == stored
+    assert sent == [PUSH, PUSH]
+    with pytest.raises(ValueError, match="Nothing was sent"):
+        robot.send_early({"delta_x": 0.0})
+    assert len(sent) == 2
+
+
+@pytest.mark.parametrize(("verb", "fps"), [("teleoperate", "--fps=60"), ("record", "--dataset.fps=30")])
+def test_a_loop_of_another_rate_is_refused_before_anything_moves(trained, tmp_path, verb, fps):
+    given = recording(trained, tmp_path / "data") if verb == "record" else options(trained, tmp_path)
+    with pytest.raises(SystemExit, match="--fps=20"):
+        cli.main([verb, *(option for option in given if "fps" not in option), fps])
 
 
 def test_a_missing_filter_is_named(trained, tmp_path):

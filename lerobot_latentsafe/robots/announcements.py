@@ -1,14 +1,15 @@
-"""What lerobot-record says aloud: it has no call that begins an episode, it *says* so, to a person."""
+"""What LeRobot's loops say aloud: they have no call that begins an episode, they *say* so, to a person."""
 
 import logging
 import re
 
 RECORDING = re.compile(r"Recording episode (\d+)$")
 RESETTING = "Reset the environment"
+RETURNING = "Returning robot to initial position"
 
 
 class Announcements(logging.Handler):
-    """Hears LeRobot announce an episode, or the pause between two (`log_say`), while it is `listening`."""
+    """Hears LeRobot announce an episode, or what comes between episodes and after them, while it is `listening`."""
 
     def __init__(self):
         super().__init__(logging.INFO)
@@ -21,14 +22,13 @@ class Announcements(logging.Handler):
         logging.getLogger().removeHandler(self)
 
     def emit(self, record: logging.LogRecord) -> None:
-        said = record.getMessage()
-        recording = RECORDING.match(said)
-        if recording:
+        said = str(record.msg)
+        if recording := RECORDING.match(said):
             self._heard = int(recording[1])
-        elif said == RESETTING:
-            self._heard = RESETTING
+        elif said.startswith((RESETTING, RETURNING)):
+            self._heard = RESETTING if said.startswith(RESETTING) else RETURNING
 
     def take(self) -> int | str | None:
-        """The last announcement since the last call: an episode's number, or `RESETTING`."""
+        """The last announcement since the last call: an episode's number, `RESETTING` or `RETURNING`."""
         heard, self._heard = self._heard, None
         return heard

@@ -37,8 +37,10 @@ class LatentSafeShieldedConfig(RobotConfig):
         mode: `filter` or `monitor`, which only reports; None takes the filter's.
         epsilon, guard: of the filter law; None takes the filter's.
         device: where the filter runs; None takes the filter's.
-        unfiltered_moves: let commands pass that the filter knows nothing of, such as the joint moves by which LeRobot
-            returns an arm to where it started. Otherwise the robot holds still instead.
+        fps: rate of the loop that drives it, if known beforehand: it must be the filter's.
+        unfiltered_moves: let pass what moves the robot between episodes (LeRobot's return of an arm to its start, a
+            person's resets), and commands of which the filter knows nothing, such as joint moves. Otherwise the first
+            are filtered like any other, and at the others the robot holds still.
         journal: a parquet file for every decision of a recording; `latentsafe record` sets it.
     """
 
@@ -48,6 +50,7 @@ class LatentSafeShieldedConfig(RobotConfig):
     epsilon: float | None = None
     guard: int | None = None
     device: str | None = None
+    fps: int | None = None
     unfiltered_moves: bool = False
     journal: Path | None = None
 

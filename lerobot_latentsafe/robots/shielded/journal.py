@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 
 from lerobot_latentsafe.filter import FilterDecision, Reason
-from lerobot_latentsafe.robots.announcements import RESETTING
 
 logger = logging.getLogger(__name__)
 
@@ -33,7 +32,7 @@ class Journal:
     def hear(self, announced: int | str) -> None:
         """Begin an episode, anew if it was begun before, or end one."""
         self.write()
-        self.episode = None if announced == RESETTING else announced
+        self.episode = announced if isinstance(announced, int) else None
         if self.episode is not None:
             self.episodes[self.episode] = []
 

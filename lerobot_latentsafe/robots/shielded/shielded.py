@@ -1,7 +1,10 @@
 """Any LeRobot robot behind a latent safety filter, for whatever drives it: a person, a replay, a policy far away."""
 
 import logging
+import math
 import time
+from collections import deque
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -9,17 +12,20 @@ import torch
 from lerobot.policies.utils import prepare_observation_for_inference
 from lerobot.robots.robot import Robot
 from lerobot.robots.utils import make_robot_from_config
-from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
+from lerobot.utils.constants import OBS_IMAGES, OBS_STATE, OBS_STR
+from lerobot.utils.feature_utils import build_dataset_frame
 
+from lerobot_latentsafe.filter import FilterDecision, Reason
 from lerobot_latentsafe.robots.announcements import Announcements
 from lerobot_latentsafe.robots.shielded.config_shielded import LatentSafeShieldedConfig
 from lerobot_latentsafe.robots.shielded.journal import Journal
-from lerobot_latentsafe.shield import decided_elsewhere
 
 logger = logging.getLogger(__name__)
 
 PAUSE_S = 1.0
 """After a pause between two decisions longer than this, what was seen before says nothing: the history starts anew."""
+RATE_DECISIONS = 10
+"""So many decisions tell at what rate the loop runs."""
 MOVED = 0.05
 """A robot has moved if a number of its state differs by this many standard deviations of the data."""
 
@@ -52,6 +58,7 @@ class LatentSafeShielded(Robot):
         self._check_fit()
         self.journal = Journal(config.journal) if config.journal else None
         self._announcements = Announcements()
+        self._sent: dict[str, float] = {}
         self._forget()
 
     def _check_fit(self) -> None:
@@ -67,15 +74,23 @@ class LatentSafeShielded(Robot):
                 f"{', '.join(wanted)}, the robot has {', '.join(cameras) or 'none'}. Name its cameras alike, or "
                 "train a filter for this robot"
             )
-        for what, own, theirs in (
-            ("acts in", list(config.action_names or []), list(robot.action_features)),
-            ("reads the state", list(config.state_names or []), scalars),
-        ):
-            if own != theirs:
-                raise ValueError(
-                    f"the filter {self.config.filter} {what} {', '.join(own)}; {robot.name} offers "
-                    f"{', '.join(theirs)}. Train a filter on data of this robot"
-                )
+        acts_in, offered = set(config.action_names), set(robot.action_features)
+        if acts_in != offered:
+            raise ValueError(
+                f"the filter {self.config.filter} acts in {', '.join(config.action_names)}; {robot.name} in "
+                f"{', '.join(robot.action_features)}. Train a filter on data of this robot"
+            )
+        unread = [name for name in config.state_names if name not in scalars]
+        if unread:
+            raise ValueError(
+                f"{robot.name} does not observe {', '.join(unread)}, which the filter {self.config.filter} reads; it "
+                f"observes {', '.join(scalars) or 'nothing'}. Train a filter on data of this robot"
+            )
+        if self.config.fps not in (None, config.fps):
+            raise ValueError(
+                f"the loop is to run at {self.config.fps} Hz, but the filter {self.config.filter} decides "
+                f"{config.fps} times a second: give --fps={config.fps} (--dataset.fps={config.fps} to record)"
+            )
 
     # -- the inner robot ---
 
@@ -116,9 +131,11 @@ class LatentSafeShielded(Robot):
         if self in _connected:
             _connected.remove(self)
         self._announcements.stop()
-        if self.journal:
-            self.journal.write()
-        self.inner.disconnect()
+        try:
+            if self.journal:
+                self.journal.write()
+        finally:
+            self.inner.disconnect()
 
     # -- the loop ---
 
@@ -127,7 +144,9 @@ class LatentSafeShielded(Robot):
         announced = self._announcements.take()
         if announced is not None:
             self._forget()
-            logger.info("the filter starts anew; it goes on filtering between episodes")
+            self._between = not isinstance(announced, int)
+            filtered = "does not filter now" if self._between and self.config.unfiltered_moves else "starts anew"
+            logger.info("%s: the filter %s", announced if self._between else f"episode {announced}", filtered)
             if self.journal:
                 self.journal.hear(announced)
         self._observation = self.inner.get_observation()
@@ -141,56 +160,110 @@ class LatentSafeShielded(Robot):
             shown["shield.intervened"] = float(decision.intervened.item())
         return {**self._observation, **shown}
 
-    def decide(self, action: dict[str, float]) -> dict[str, float]:
-        """What will be executed instead of an action, or that action itself; `send_action` then sends it as it is."""
-        names = self.filter.config.action_names
-        if set(action) != set(names):
-            return self._outside(action)
-        if not self._fresh:
-            self.get_observation()
-        self._fresh = False
-        now = time.perf_counter()
-        if self._decided_at is not None and now - self._decided_at > PAUSE_S:
-            logger.info("no decision for %.1f s: the filter starts anew", now - self._decided_at)
-            self.filter.shield.reset()
-        proposed = torch.tensor([[float(action[name]) for name in names]])
-        if decided_elsewhere(self.filter.shield, proposed, 1.0 / self.filter.config.fps):
-            self._say_once("these actions come from a shielded policy of this process; they are not filtered again")
-            self.filter.shield.reset()  # it does not see what happens meanwhile
-            self._decided = dict(action)
-            return self._decided
-        age = self._age(now)
-        batch = prepare_observation_for_inference(self._frame(), self.filter.device)
-        decision = self.filter.shield(batch, proposed, age)
-        self._decided_at = time.perf_counter()
-        if self.journal:
-            self.journal.add(decision)
-        self._decided = dict(zip(names, decision.action[0].tolist()))
-        return self._decided
-
     def send_action(self, action: dict[str, float]) -> dict[str, float]:
         """Filter an action and have the inner robot execute the result.
 
         Returns:
             What was executed.
         """
-        decided = action if action == self._decided else self.decide(action)
-        self._decided = None
-        sent = self.inner.send_action(decided)
-        names = self.filter.config.action_names
-        if set(sent) == set(names) and self.filter.shield.executed is not None:  # the robot may have clipped it
+        early, self._sent_early = self._sent_early, None
+        if early is not None and action == early:
+            return early
+        sent = self.inner.send_action(self._decide(action))
+        self._sent.update(sent)
+        shield, names = self.filter.shield, self.filter.config.action_names
+        if set(sent) == set(names) and shield.executed is not None:  # the robot may have clipped it
             executed = torch.tensor([[float(sent[name]) for name in names]], device=self.filter.device)
-            self.filter.shield.executed = self.filter.normalise_action(executed).nan_to_num(0.0).clamp(-1, 1)
+            shield.executed = self.filter.normalise_action(executed).nan_to_num(0.0).clamp(-1, 1)
         return sent
+
+    def send_early(self, action: dict[str, float]) -> dict[str, float]:
+        """Like `send_action`; a `send_action` of the result that follows has nothing left to do.
+
+        Raises:
+            ValueError: not the robot's action names; nothing was sent.
+        """
+        if set(action) != set(self.action_features):
+            raise ValueError(
+                f"the operator commands {', '.join(action)}; {self.name} takes {', '.join(self.action_features)}. "
+                "Nothing was sent; use a teleoperator of this robot"
+            )
+        self._sent_early = None
+        sent = self.send_action(action)
+        self._sent_early = dict(sent)
+        return dict(sent)
+
+    def _decide(self, action: dict[str, float]) -> dict[str, float]:
+        """What is to be executed instead of an action, or that action itself."""
+        names, shield, period = self.filter.config.action_names, self.filter.shield, 1.0 / self.filter.config.fps
+        known = set(action) == set(names)
+        if self.config.unfiltered_moves and (self._between or not known) and all(map(math.isfinite, action.values())):
+            self._say_once("moves between episodes, or of other names, are not filtered (--robot.unfiltered_moves)")
+            self._decided_at = -math.inf
+            return action
+        if not known:
+            return self._hold(action)
+        if not self._fresh:
+            self.get_observation()
+        self._fresh = False
+        now = time.perf_counter()
+        rate = self._check_rate(now)
+        proposed, age = torch.tensor([[float(action[name]) for name in names]]), self._age(now)
+        if rate == Reason.PASSED and age <= period and shield.adopt(proposed, period):
+            self._say_once("these actions come from a policy under this very filter; they are not filtered again")
+        else:
+            batch = prepare_observation_for_inference(self._frame(), self.filter.device)
+            shield(batch, proposed, age, known=rate)
+        return self._carry_out(shield.decision, action)
+
+    def _carry_out(self, decision: FilterDecision, action: dict[str, float]) -> dict[str, float]:
+        """The action of a decision on an action, noted in the journal."""
+        if self.journal:
+            self.journal.add(decision)
+        if not decision.intervened.item():
+            return action
+        return dict(zip(self.filter.config.action_names, decision.action[0].tolist()))
+
+    def _hold(self, action: dict[str, float]) -> dict[str, float]:
+        """Instead of a command of which the filter knows nothing: no motion, the kept commands as they are."""
+        self._say_once(
+            f"the filter knows nothing of a command of {', '.join(action)}: "
+            "the robot holds still. --robot.unfiltered_moves=true lets such moves pass unfiltered"
+        )
+        self._decided_at = -math.inf
+        config, now = self.filter.config, {**(self._observation or {}), **self._sent}
+        still = dict(zip(config.action_names, self.filter.hold_action(1)[0].tolist()))
+        return {**still, **{name: float(now[name]) for name in config.kept_commands if name in now}}
 
     # -- what the filter is told ---
 
+    def _check_rate(self, now: float) -> Reason:
+        """Start anew after a pause; a loop that runs at another rate than the filter is no ground to decide on."""
+        fps, gap = self.filter.config.fps, now - self._decided_at if self._decided_at is not None else 0.0
+        self._decided_at = now
+        if gap > PAUSE_S:
+            logger.info("the filter starts anew after a pause")
+            self.filter.shield.reset()
+            self._gaps.clear()
+        elif gap > 0:
+            self._gaps.append(gap)
+        if len(self._gaps) < RATE_DECISIONS:
+            return Reason.PASSED
+        rate = 1.0 / median(self._gaps)
+        if not fps / 2 < rate < 2 * fps:
+            slow_or_fast = "fewer than half" if rate <= fps / 2 else "more than twice"
+            self._say_once(
+                f"actions come {slow_or_fast} as often as the filter decides, {fps} times a second: run the loop at "
+                f"--fps={fps}"
+            )
+        return Reason.WRONG_RATE if rate >= 2 * fps else Reason.PASSED
+
     def _frame(self) -> dict[str, np.ndarray]:
         """The last observation as LeRobot's datasets name and type it."""
-        seen = self._observation
-        state = np.array([seen[name] for name in self.filter.config.state_names], np.float32)
-        keys = self.filter.world_model.image_keys
-        return {OBS_STATE: state, **{key: seen[key.removeprefix(f"{OBS_IMAGES}.")] for key in keys}}
+        names = self.filter.config.state_names
+        state = {"dtype": "float32", "shape": (len(names),), "names": names}
+        pictures = {key: {"dtype": "image"} for key in self.filter.world_model.image_keys}
+        return build_dataset_frame({OBS_STATE: state, **pictures}, self._observation, prefix=OBS_STR)
 
     def _watch_cameras(self) -> None:
         """Note since when each picture has been the same although the robot moved: such a camera is frozen."""
@@ -208,21 +281,6 @@ class LatentSafeShielded(Robot):
         frozen = [camera["at"] for camera in self._cameras.values() if camera["repeats"] > 1]
         return now - min([self._seen_at, *frozen])
 
-    def _outside(self, action: dict[str, float]) -> dict[str, float]:
-        """A command of which the filter knows nothing."""
-        still = self.filter.shield.hold(1)[0].tolist()
-        self.filter.shield.reset()
-        if self.config.unfiltered_moves:
-            self._say_once(f"moves of {', '.join(action)} are not filtered (--robot.unfiltered_moves)")
-            self._decided = action
-        else:
-            self._say_once(
-                f"the filter knows nothing of a command of {', '.join(action)}: "
-                "the robot holds still. --robot.unfiltered_moves=true lets such moves pass unfiltered"
-            )
-            self._decided = dict(zip(self.filter.config.action_names, still))
-        return self._decided
-
     def _say_once(self, message: str) -> None:
         if message not in self._said:
             logger.warning(message)
@@ -231,9 +289,10 @@ class LatentSafeShielded(Robot):
     def _forget(self) -> None:
         """Start an episode: nothing seen, nothing decided."""
         self.filter.shield.reset()
-        self._observation, self._fresh, self._seen_at = None, False, 0.0
-        self._decided: dict[str, float] | None = None
+        self._observation, self._fresh, self._seen_at, self._between = None, False, 0.0, False
+        self._sent_early: dict[str, float] | None = None
         self._decided_at: float | None = None
+        self._gaps: deque[float] = deque(maxlen=RATE_DECISIONS)
         self._cameras: dict[str, dict] = {}
         self._said: set[str] = set()
 
