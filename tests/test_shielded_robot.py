@@ -285,12 +285,13 @@ def recording(trained, root):
 
 
 @pytest.mark.parametrize("epsilon", [ALWAYS, NEVER])
-def test_a_recording_stores_what_was_executed(tmp_path, epsilon):
+def test_a_recording_stores_what_was_executed(tmp_path, epsilon, capsys):
     import pyarrow.parquet as pq
 
     trained = tiny.save_franka_filter(tmp_path / "filter", epsilon=epsilon)
     root = tmp_path / "data"
     cli.main(["record", *recording(trained, root)])
+    assert "stores what was proposed" not in capsys.readouterr().err
     dataset = LeRobotDataset("me/shielded", root=root)
     rows = pq.read_table(root / "shield" / "decisions.parquet").to_pylist()
     assert [r["episode_index"] for r in rows] == [int(i) for i in dataset.hf_dataset["episode_index"]]
@@ -327,6 +328,35 @@ def test_lerobots_own_commands_take_the_shielded_robot(trained, tmp_path, monkey
     found = decision_columns(journal, np.zeros(frames, int), np.arange(frames))
     assert found["intervened"].all()
     assert np.allclose(found["proposed"], np.array(dataset.hf_dataset["action"])[:frames], atol=1e-6)
+
+
+def test_a_journal_goes_on_and_forgets_what_is_recorded_again(tmp_path):
+    import pyarrow.parquet as pq
+
+    from lerobot_latentsafe.filter import least_restrictive
+    from lerobot_latentsafe.robots.announcements import RESETTING
+    from lerobot_latentsafe.robots.shielded.journal import Journal
+
+    def note(journal, announced, values):
+        journal.hear(announced)
+        for value in values:
+            judged = least_restrictive(torch.zeros(1, 2), torch.ones(1, 2), torch.tensor([value]), torch.ones(1), 0.0)
+            journal.add(judged)
+
+    path = tmp_path / "shield" / "decisions.parquet"
+    first = Journal(path)
+    note(first, 0, [0.5, -0.5])
+    note(first, RESETTING, [0.1])
+    note(first, 1, [0.2, 0.2, 0.2])  # cut off, and recorded again when the recording goes on
+    first.write()
+    resumed = Journal(path)
+    note(resumed, 1, [0.7])
+    resumed.write()
+    rows = [
+        (r["episode_index"], r["frame_index"], round(r["value"], 1), r["reason"])
+        for r in pq.read_table(path).to_pylist()
+    ]
+    assert rows == [(0, 0, 0.5, "passed"), (0, 1, -0.5, "unsafe_value"), (1, 0, 0.7, "passed")]
 
 
 def test_decisions_of_another_dataset_are_refused(tmp_path):
@@ -376,6 +406,16 @@ def test_teleoperation_is_shielded(trained, monkeypatch, executed):
     executed.clear()
     cli.main(["teleoperate", *shielded_options(trained, **OPERATOR | {"robot.epsilon": NEVER})])
     assert len(executed) > 2 and all(sent == pytest.approx(proposed) for proposed, sent in executed)
+
+
+def test_lerobot_record_is_shielded_but_stores_what_was_proposed(trained, tmp_path, monkeypatch, executed, capsys):
+    from lerobot.scripts import lerobot_record
+
+    given = [o for o in recording(trained, tmp_path / "data") if not o.startswith(("--filter", "--robot."))]
+    monkeypatch.setattr("sys.argv", ["lerobot-record", *shielded_options(trained), *given])
+    lerobot_record.main()
+    assert len(executed) > 2 and all(sent != proposed for proposed, sent in executed)
+    assert "`latentsafe record` stores that" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("epsilon", "once"), [(None, True), (ALWAYS, False)])

@@ -59,6 +59,7 @@ class LatentSafeShielded(Robot):
         self.journal = Journal(config.journal) if config.journal else None
         self._announcements = Announcements()
         self._sent: dict[str, float] = {}
+        self._early = False
         self._forget()
 
     def _check_fit(self) -> None:
@@ -144,7 +145,7 @@ class LatentSafeShielded(Robot):
         announced = self._announcements.take()
         if announced is not None:
             self._forget()
-            self._between = not isinstance(announced, int)
+            self._phase = announced
             filtered = "does not filter now" if self._between and self.config.unfiltered_moves else "starts anew"
             logger.info("%s: the filter %s", announced if self._between else f"episode {announced}", filtered)
             if self.journal:
@@ -188,7 +189,7 @@ class LatentSafeShielded(Robot):
                 f"the operator commands {', '.join(action)}; {self.name} takes {', '.join(self.action_features)}. "
                 "Nothing was sent; use a teleoperator of this robot"
             )
-        self._sent_early = None
+        self._early, self._sent_early = True, None
         sent = self.send_action(action)
         self._sent_early = dict(sent)
         return dict(sent)
@@ -216,12 +217,21 @@ class LatentSafeShielded(Robot):
             shield(batch, proposed, age, known=rate)
         return self._carry_out(shield.decision, action)
 
+    @property
+    def _between(self) -> bool:
+        """Whether LeRobot said that what comes belongs to no episode."""
+        return isinstance(self._phase, str)
+
     def _carry_out(self, decision: FilterDecision, action: dict[str, float]) -> dict[str, float]:
         """The action of a decision on an action, noted in the journal."""
         if self.journal:
             self.journal.add(decision)
         if not decision.intervened.item():
             return action
+        if isinstance(self._phase, int) and not self._early:
+            self._say_once(
+                "LeRobot stores what was proposed, not what is executed now; `latentsafe record` stores that"
+            )
         return dict(zip(self.filter.config.action_names, decision.action[0].tolist()))
 
     def _hold(self, action: dict[str, float]) -> dict[str, float]:
@@ -289,7 +299,8 @@ class LatentSafeShielded(Robot):
     def _forget(self) -> None:
         """Start an episode: nothing seen, nothing decided."""
         self.filter.shield.reset()
-        self._observation, self._fresh, self._seen_at, self._between = None, False, 0.0, False
+        self._observation, self._fresh, self._seen_at = None, False, 0.0
+        self._phase: int | str | None = None
         self._sent_early: dict[str, float] | None = None
         self._decided_at: float | None = None
         self._gaps: deque[float] = deque(maxlen=RATE_DECISIONS)
