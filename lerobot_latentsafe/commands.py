@@ -186,7 +186,9 @@ class TrainMargin:
 class TrainReachability:
     """Learn V and the fallback policy in the imagination of a trained, frozen world model.
 
-    With several --seeds each gets its own critic, in <output_dir>/seed_<n>.
+    With several --seeds each gets its own critic, in <output_dir>/seed_<n>. `torchrun --nproc_per_node=N
+    $(which latentsafe) train-reachability ...` shares imagined states and batches among processes; what is learned is
+    the same.
     """
 
     policy: PolicySource
@@ -197,12 +199,15 @@ class TrainReachability:
     """Gradient steps; None takes the configuration's."""
 
     def run(self) -> None:
+        from lerobot_latentsafe import ranks
         from lerobot_latentsafe.training import train_reachability
 
-        for seed in self.seeds:
-            output_dir = self.output_dir if len(self.seeds) == 1 else self.output_dir / f"seed_{seed}"
-            train_reachability(self.policy.path, self.dataset.metadata(), output_dir, seed, self.steps)
-            print(f"filter with a trained critic in {output_dir}")
+        with ranks.joined():
+            for seed in self.seeds:
+                output_dir = self.output_dir if len(self.seeds) == 1 else self.output_dir / f"seed_{seed}"
+                train_reachability(self.policy.path, self.dataset.metadata(), output_dir, seed, self.steps)
+                if ranks.rank() == 0:
+                    print(f"filter with a trained critic in {output_dir}")
 
 
 @dataclass

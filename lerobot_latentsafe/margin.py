@@ -4,6 +4,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from lerobot_latentsafe.ranks import mean_over_ranks
+
 
 class FailureMargin(nn.Module):
     """l(z): features (..., D) -> (...,). Negative means failure.
@@ -34,8 +36,6 @@ def hinge_loss(margin: Tensor, failure: Tensor, delta: float = 0.75) -> Tensor:
         failure: same shape; 1 failing, 0 safe, -1 unlabelled (ignored).
         delta: the margin each class is pushed beyond.
     """
-    loss = margin.sum() * 0.0  # keeps the graph when a batch holds neither class
-    for is_class, signed in ((failure == 0, margin), (failure == 1, -margin)):
-        if is_class.any():
-            loss = loss + F.relu(delta - signed[is_class]).mean()
-    return loss
+    safe, failing = failure == 0, failure == 1
+    n_safe, n_failing = mean_over_ranks(torch.stack([safe.sum(), failing.sum()])).clamp(min=1e-6)
+    return F.relu(delta - margin[safe]).sum() / n_safe + F.relu(delta + margin[failing]).sum() / n_failing

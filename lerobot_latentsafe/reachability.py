@@ -17,10 +17,12 @@ import torch
 from torch import Tensor, nn
 
 from lerobot_latentsafe.margin import FailureMargin
+from lerobot_latentsafe.ranks import any_rank, from_first_rank, gathered, share, sum_over_ranks
 from lerobot_latentsafe.world_models.base import Latent, WorldModel, map_latent, replace_rows, select
 
 Starts = Callable[[int], Latent]
-"""Draws a batch of latents from which imagination starts: encoded dataset windows."""
+"""Draws a batch of latents from which imagination starts: encoded dataset windows. Of several ranks, each gets its
+share of the batch (see `ranks.py`)."""
 
 
 class Imagination(Protocol):
@@ -274,6 +276,9 @@ class LatentReachability:
 
     Imagined states live in a pool of tensors; every `refresh` steps a slice of it is imagined anew from fresh starts.
     With discrete actions the successors under *all* actions are imagined, so each update backs up every action.
+
+    Several ranks learn what one learns: they make the same draws, of which each imagines and backs up its share. What
+    they imagine is gathered in the pool of each, and gradients are summed.
     """
 
     def __init__(
@@ -305,15 +310,15 @@ class LatentReachability:
             the K successors are those of all candidates, of which `choice` (N,) was taken, or the only one when actions
             are continuous; and what `_add_outcomes` says of the rest of the trajectory.
         """
-        critic, config, n = self.critic, self.config, self.chunk
-        latent = self.starts(n)
-        greedy = self._rand(n) < config.greedy
-        held = self._random_actions(n)
+        critic, config = self.critic, self.config
+        latent = self.starts(self.chunk)
+        greedy = self._rand() < config.greedy
+        held, n = self._random_actions(), len(greedy)
         rows: list[dict[str, Tensor]] = []
         for t in range(config.horizon):
             features = self.imagination.features(latent)
             x = critic.project(features)
-            held = torch.where((self._rand(n) < config.switch)[:, None], self._random_actions(n), held)
+            held = torch.where((self._rand() < config.switch)[:, None], self._random_actions(), held)
             action, choice = self._explore(x, greedy, held)
             action = self.imagination.complete(latent, action)
             if critic.discrete and t < self.kept:
@@ -336,10 +341,11 @@ class LatentReachability:
             )
             taken = torch.arange(n, device=x.device) * k + choice
             latent = select(after, taken)
-            if ended[taken].any():
-                latent = replace_rows(latent, self.starts(n), where=ended[taken])
+            if any_rank(ended[taken].any()):
+                latent = replace_rows(latent, self.starts(self.chunk), where=ended[taken])
         self._add_outcomes(rows)
-        return {key: torch.cat([row[key] for row in rows[: self.kept]]) for key in rows[0]}
+        columns = {key: torch.stack([row[key] for row in rows[: self.kept]], 1) for key in rows[0]}
+        return {key: gathered(column).transpose(0, 1).flatten(0, 1) for key, column in columns.items()}
 
     @staticmethod
     def _add_outcomes(rows: list[dict[str, Tensor]]) -> None:
@@ -359,12 +365,12 @@ class LatentReachability:
                 row["end_over"] = over | later["end_over"]
             later = row
 
-    def _random_actions(self, n: int) -> Tensor:
+    def _random_actions(self) -> Tensor:
         """(n, A): the index of a candidate in the first column, or an action if they are continuous."""
         critic = self.critic
         if critic.discrete:
-            return torch.randint(len(critic.candidates), (n, 1), generator=self.generator, device=critic.low.device)
-        return critic.between(self._rand(n, len(critic.low)))
+            return self._draw(torch.randint, len(critic.candidates), (self.chunk, 1))
+        return critic.between(self._rand(len(critic.low)))
 
     def _explore(self, x: Tensor, greedy: Tensor, held: Tensor) -> tuple[Tensor, Tensor]:
         """Actions (n, A) and the index of the successor they lead to (n,)."""
@@ -373,17 +379,24 @@ class LatentReachability:
             choice = torch.where(greedy, critic.q(x).argmax(-1), held[:, 0])
             return critic.candidates[choice], choice
         action = critic.act(x)
-        noise = 0.15 * torch.randn(action.shape, generator=self.generator, device=x.device)
+        noise = 0.15 * self._draw(torch.randn, (self.chunk, action.shape[1]))
         action = (action + noise * (critic.high - critic.low)).clamp(critic.low, critic.high)
         action = torch.where(greedy[:, None], action, held)
         return action, torch.zeros(len(x), dtype=torch.long, device=x.device)
 
     def _rand(self, *shape: int) -> Tensor:
-        return torch.rand(*shape, generator=self.generator, device=self.critic.feature_mean.device)
+        """Uniform in [0, 1), for each of this rank's n trajectories: (n, *shape)."""
+        return self._draw(torch.rand, (self.chunk, *shape))
+
+    def _draw(self, function: Callable[..., Tensor], *arguments: object) -> Tensor:
+        """This rank's share of what all ranks draw."""
+        return share(function(*arguments, generator=self.generator, device=self.critic.feature_mean.device))
 
     @torch.no_grad()
     def _fill_pool(self) -> None:
-        self.critic.set_projection(self.imagination.features(self.starts(4096)))
+        self.critic.set_projection(gathered(self.imagination.features(self.starts(4096))))
+        for tensor in self.critic.state_dict().values():
+            from_first_rank(tensor)  # the same to the last bit, whatever computes the others
         self.target.load_state_dict(self.critic.state_dict())
         n_chunks = max(1, self.config.pool // (self.chunk * self.kept))
         chunks = [self.imagine() for _ in range(n_chunks)]
@@ -410,9 +423,8 @@ class LatentReachability:
         if self.step_count and self.step_count % config.refresh == 0:
             self._refresh_pool()
         gamma = discount(progress, config)
-        picked = torch.randint(
-            len(self.pool["choice"]), (config.batch_size,), generator=self.generator, device=self.pool["choice"].device
-        )
+        picked = self._draw(torch.randint, len(self.pool["choice"]), (config.batch_size,))
+        weight = len(picked) / config.batch_size  # of this rank's means
         batch = {key: value[picked] for key, value in self.pool.items()}
         target = self._td_target(batch, gamma)
         critic_loss = self._cautious_loss(self._predict(batch) - target)
@@ -420,17 +432,18 @@ class LatentReachability:
         if self.critic.actor is not None:
             loss = loss - self._actor_objective(batch["x"])
         self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
+        (weight * loss).backward()
+        metrics = weight * torch.stack([critic_loss.detach(), target.mean()])
+        sum_over_ranks([p.grad for group in self.optimizer.param_groups for p in group["params"]] + [metrics])
         self.optimizer.step()
         with torch.no_grad():
             for old, new in zip(self.target.parameters(), self.critic.parameters()):
                 old.lerp_(new, config.tau)
         self.step_count += 1
-        if not math.isfinite(critic_loss.item()):
-            raise FloatingPointError(
-                f"critic loss is {critic_loss.item()} at step {self.step_count}; lower --reachability.lr"
-            )
-        return {"critic_loss": critic_loss.item(), "gamma": gamma, "value": target.mean().item()}
+        error, value = metrics.tolist()
+        if not math.isfinite(error):
+            raise FloatingPointError(f"critic loss is {error} at step {self.step_count}; lower --reachability.lr")
+        return {"critic_loss": error, "gamma": gamma, "value": value}
 
     def _cautious_loss(self, error: Tensor) -> Tensor:
         """Squared error in which an overestimate, a danger missed, weighs `caution` times an underestimate."""

@@ -10,7 +10,9 @@ from torch import Tensor
 from lerobot_latentsafe.checkpoint import WEIGHTS, seal
 from lerobot_latentsafe.datasets.clips import ClipReader
 from lerobot_latentsafe.margin import FailureMargin, hinge_loss
+from lerobot_latentsafe.memory import keep_freed_memory
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, adopt_dataset
+from lerobot_latentsafe.ranks import gathered, rank, share
 from lerobot_latentsafe.reachability import LatentReachability, Starts
 from lerobot_latentsafe.world_models.base import Latent, map_latent, select
 
@@ -120,7 +122,7 @@ def encoded_starts(
         max_frames: frames encoded at most; fewer where their latents would not fit in `STARTS_BYTES`.
 
     Returns:
-        A sampler of latents.
+        A sampler of latents. Several ranks encode a share each and gather all.
     """
     latent_bytes = sum(t.nbytes for t in policy.world_model.initial(1).values())
     max_frames = min(max_frames, STARTS_BYTES // (2 * latent_bytes))  # two latents of each
@@ -129,6 +131,7 @@ def encoded_starts(
     first = np.arange(offset, n, length)
     first = first[torch.randperm(len(first), generator=generator)[: max(1, max_frames // length)].numpy()]
     single, filtered = [], []
+    first = share(torch.from_numpy(first)).numpy()
     for chunk in np.array_split(first, max(1, len(first) // 64)):
         clip = reader.cut(chunk, policy)
         kept = clip.valid.flatten()
@@ -137,11 +140,13 @@ def encoded_starts(
         percepts = {k: v.flatten(0, 1)[kept] for k, v in clip.percepts.items()}
         before = policy.first_action(clip.action.flatten(0, 1)[kept])
         single.append(policy.world_model.observe(None, before, percepts, clip.state.flatten(0, 1)[kept]))
-    pool: Latent = {k: torch.cat([z[k] for z in (*single, *filtered)]) for k in single[0]}
+    pool: Latent = {
+        k: torch.cat([gathered(torch.cat([z[k] for z in part])) for part in (single, filtered)]) for k in single[0]
+    }
     size = len(next(iter(pool.values())))
 
     def draw(count: int) -> Latent:
-        picked = torch.randint(size, (count,), generator=generator).to(policy.device)
+        picked = share(torch.randint(size, (count,), generator=generator)).to(policy.device)
         return map_latent(pool, lambda t: t[picked])
 
     return draw
@@ -162,6 +167,8 @@ def train_reachability(
 ) -> LatentSafePolicy:
     """Load a stage-1 checkpoint, learn its safety critic, save the filter.
 
+    Several ranks share the work (see `LatentReachability`); the first one saves.
+
     Raises:
         UntrainedFilterError: the world model was never trained.
         FileExistsError: output_dir holds a checkpoint already.
@@ -170,6 +177,8 @@ def train_reachability(
 
     refuse_existing(output_dir)
     policy, reader = load_with_cache(path, dataset_meta, seed)
+    if policy.device.type == "cpu":
+        keep_freed_memory()
     config = policy.config.reachability
     if steps is not None:
         config.steps = steps
@@ -180,7 +189,7 @@ def train_reachability(
     started = time.process_time()
     starts = encoded_starts(policy, reader, generator)
     learner = LatentReachability(policy.imagination, policy.critic, starts, config)
-    progress = trange(config.steps, desc="reachability", unit="step")
+    progress = trange(config.steps, desc="reachability", unit="step", disable=rank() > 0)
     for step in progress:
         metrics = learner.update()
         if step % 200 == 0:
@@ -188,8 +197,9 @@ def train_reachability(
     policy.config.stage = "reachability"
     policy.critic.eval()
     policy.config.frame_cache = None
-    save_filter(policy, output_dir)
-    print(f"reachability: {time.process_time() - started:.0f} CPU-s")
+    if rank() == 0:
+        save_filter(policy, output_dir)
+        print(f"reachability: {time.process_time() - started:.0f} CPU-s")
     return policy
 
 

@@ -101,8 +101,9 @@ class FrameCache:
             )
         try:
             percepts = {k: np.load(folder / f"{k}.npy", mmap_mode="r") for k in manifest["percepts"]}
-            scales = {k: np.load(scale_file(folder, k)) for k, v in percepts.items() if v.dtype == np.int8}
-            state, action = np.load(folder / "state.npy"), np.load(folder / "action.npy")
+            eight_bits = [k for k, v in percepts.items() if v.dtype == np.int8]
+            scales = {k: np.load(scale_file(folder, k), mmap_mode="r") for k in eight_bits}
+            state, action = (np.load(folder / f"{k}.npy", mmap_mode="r") for k in ("state", "action"))
         except (OSError, ValueError, EOFError) as e:
             raise FrameCacheError(f"{folder} is torn ({e}); delete it and run latentsafe cache again") from e
         lengths = {len(a) for a in (*percepts.values(), *scales.values(), state, action)}

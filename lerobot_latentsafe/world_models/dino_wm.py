@@ -17,6 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from lerobot_latentsafe.ranks import from_first_rank, mean_over_ranks
 from lerobot_latentsafe.world_models.base import Clip, Latent, WorldModelConfig
 from lerobot_latentsafe.world_models.ends import EndAware
 from lerobot_latentsafe.world_models.frame_transformer import FrameTransformer, Linear
@@ -269,7 +270,7 @@ class DinoWM(EndAware):
     def _last_observed(self, clip: Clip) -> int:
         """Index of the last frame seen before imagination takes over; random in training."""
         most = min(self.config.observed, clip.state.shape[1] - 1)
-        return int(torch.randint(most, ())) if self.training else most - 1
+        return int(from_first_rank(torch.randint(most, (), device=clip.state.device))) if self.training else most - 1
 
     def _imagine(self, ahead: _Ahead, clip: Clip, seen: Tensor, last: int) -> Latent:
         """Frames (B, N, ...) after `last`; the first of them is what teacher forcing has predicted."""
@@ -286,7 +287,7 @@ class DinoWM(EndAware):
         """Mean squared change from one frame to the next, of each camera's tokens (cameras,) and of state ()."""
         tokens, state = (torch.diff(frames[name], dim=1) for name in ("tokens", "state"))
         change = {"tokens": self._by_camera(tokens).mean(-2), "state": state.square().mean(-1)}
-        return {name: _mean(value, goes_on).clamp(min=1e-6) for name, value in change.items()}
+        return {name: mean_over_ranks(_mean(value, goes_on)).clamp(min=1e-6) for name, value in change.items()}
 
     def _errors(
         self, tokens: Tensor, state: Tensor, frames: dict[str, Tensor], counts: Tensor, since: slice,
@@ -311,7 +312,9 @@ class DinoWM(EndAware):
     def _weight(self, change: Tensor, counts: Tensor) -> Tensor:
         """Weights of tokens that changed so much (B, N, P, cameras), relative to their frame's mean over the batch."""
         share, counts = self.config.change_weight, _like(counts, change)
-        usual = (change * counts).mean((0, 2), keepdim=True) / counts.float().mean((0, 2), keepdim=True).clamp(min=1e-6)
+        parts = ((change * counts).mean((0, 2), keepdim=True), counts.float().mean((0, 2), keepdim=True))
+        usual, counted = (mean_over_ranks(part) for part in parts)
+        usual = usual / counted.clamp(min=1e-6)
         return 1 - share + share * (change / usual.clamp(min=1e-6)).clamp(max=MOST_WEIGHT)
 
 
@@ -321,8 +324,8 @@ def _like(mask: Tensor, x: Tensor) -> Tensor:
 
 
 def _mean(x: Tensor, counts: Tensor) -> Tensor:
-    """Mean over batch and time of (B, N, ...) where it counts."""
-    return (x * _like(counts, x)).sum((0, 1)) / counts.sum().clamp(min=1)
+    """Mean over batch and time of (B, N, ...) where it counts; on several ranks, their average is that mean."""
+    return (x * _like(counts, x)).sum((0, 1)) / mean_over_ranks(counts.sum()).clamp(min=1e-6)
 
 
 def _check(config: DinoWMConfig) -> None:

@@ -4,6 +4,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from lerobot_latentsafe.ranks import any_rank, mean_over_ranks
 from lerobot_latentsafe.world_models.base import Clip, Latent, WorldModel
 
 
@@ -23,9 +24,8 @@ class EndAware(WorldModel):
     def end_loss(self, features: Tensor, clip: Clip) -> Tensor:
         """Cross-entropy of the head, which teaches the features nothing."""
         known = (clip.terminal >= 0) & clip.valid
-        if not known.any():
-            return features.sum() * 0.0
         if self.training:
-            self.ends_seen += (clip.terminal[known] == 1).any()
-        logits = self.continues(features.detach()).squeeze(-1)[known]
-        return F.binary_cross_entropy_with_logits(logits, (clip.terminal[known] == 0).float())
+            self.ends_seen += any_rank((clip.terminal[known] == 1).any())
+        logits, goes_on = self.continues(features.detach()).squeeze(-1)[known], (clip.terminal[known] == 0).float()
+        error = F.binary_cross_entropy_with_logits(logits, goes_on, reduction="sum")
+        return error / mean_over_ranks(known.sum()).clamp(min=1e-6)

@@ -14,6 +14,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from lerobot_latentsafe.ranks import from_first_rank, mean_over_ranks
 from lerobot_latentsafe.world_models.base import Clip, Latent, WorldModel, WorldModelConfig, replace_rows
 from lerobot_latentsafe.world_models.perception import Perception, PerceptionConfig
 
@@ -107,7 +108,7 @@ class FrameGRU(WorldModel):
     def loss(self, clip: Clip) -> tuple[Tensor, Tensor, dict[str, float]]:
         """Squared errors of all predicted frames, in units of what changes from one frame to the next."""
         length = clip.state.shape[1]
-        observed = int(torch.randint(1, self.config.observed + 1, ()))
+        observed = int(from_first_rank(torch.randint(1, self.config.observed + 1, (), device=clip.state.device)))
         seen = {**clip.percepts, "state": clip.state}
         latent = start = self.initial(len(clip.state))
         predicted, rows = [], []
@@ -125,6 +126,6 @@ class FrameGRU(WorldModel):
             truth = seen[name]
             change = torch.diff(truth, dim=1, prepend=truth[:, :1]).square() * counts
             error = (torch.stack([z[name] for z in predicted], 1) - truth).square() * counts
-            losses[f"loss_{name}"] = error.sum() / change.sum().clamp(min=1e-6)
+            losses[f"loss_{name}"] = error.sum() / mean_over_ranks(change.sum()).clamp(min=1e-6)
         metrics = {name: value.item() for name, value in losses.items()}
         return sum(losses.values()), torch.stack(rows, 1), metrics

@@ -12,6 +12,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from lerobot_latentsafe.ranks import mean_over_ranks, randn_like
 from lerobot_latentsafe.world_models.base import Clip, Latent, WorldModelConfig
 from lerobot_latentsafe.world_models.ends import EndAware
 
@@ -239,7 +240,7 @@ class RSSM(EndAware):
         h, x, mean, std = self._filter_sampled(embedding, clip)
         features = torch.cat([x, h], -1)
         weight = clip.valid.float()
-        weight = weight / weight.sum().clamp(min=1)
+        weight = weight / mean_over_ranks(weight.sum()).clamp(min=1)
 
         kl_dynamics, kl_representation, kl = self._balanced_kl(h, mean, std, weight)
         error = {}
@@ -269,7 +270,7 @@ class RSSM(EndAware):
             h, x = torch.where(first, start["h"], h), torch.where(first, start["x"], x)
             h = self._recur(h, x, clip.action[:, t])
             mean, std = self._posterior(h, embedding[:, t])
-            x = mean + std * torch.randn_like(std)
+            x = mean + std * randn_like(std)
             rows.append((h, x, mean, std))
         h, x, mean, std = (torch.stack(column, 1) for column in zip(*rows))
         return h, x, mean, std
@@ -294,7 +295,7 @@ class RSSM(EndAware):
         self.mean_count += 1
         for key, name in self.cameras.items():
             mean = getattr(self, f"mean_{name}")
-            mean.lerp_(clip.percepts[key].mean((0, 1)), float(1 / self.mean_count))
+            mean.lerp_(mean_over_ranks(clip.percepts[key].mean((0, 1))), float(1 / self.mean_count))
 
 
 def _gaussian_kl(mean1: Tensor, std1: Tensor, mean2: Tensor, std2: Tensor) -> Tensor:
