@@ -25,6 +25,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "check-labels": ("CheckLabels", "list the labels that a trained filter disagrees with"),
     "auto-label": ("AutoLabel", "let a function or a vision-language model label the rest"),
     "write-labels": ("WriteLabels", "copy a dataset with its labels as columns, and push it on request"),
+    "picture-features": ("PictureFeatures", "draw what an encoder makes of the bag's variants"),
     "report": ("Report", "write one HTML file about a filter and what it changes"),
     "path": ("PathOf", "print the folder of a committed checkpoint, for LeRobot's commands"),
 }

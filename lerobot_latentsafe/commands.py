@@ -579,6 +579,34 @@ class Report:
 
 
 @dataclass
+class PictureFeatures:
+    """Draw each variant of the bag beside the first three principal components of its patch features, as colours.
+
+    One basis for all: what has one colour everywhere looks the same to the encoder, whatever the bag is made of.
+    """
+
+    encoder: str = "auto"
+    """auto, dinov2, dinov2_registers, dinov3, efficientnet_lite0, a folder or a Hub id."""
+    image_size: int = 224
+    """Pixels; a multiple of the encoder's patch."""
+    behavior: str = "closed_end"
+    step: int = 36
+    """Control step of the behaviour that is drawn."""
+    seed: int = 5
+    output: Path = Path("outputs/features.png")
+
+    def run(self) -> None:
+        from lerobot_latentsafe.evaluation.feature_picture import draw_features, see_variants
+        from lerobot_latentsafe.evaluation.figures import save
+        from lerobot_latentsafe.world_models.encoders import load_encoder
+
+        encoder = load_encoder(self.encoder)
+        seen = see_variants(self.image_size, self.behavior, self.step, self.seed)
+        save(draw_features(encoder, seen), self.output)
+        print(f"{encoder.name} on {len(seen)} variants in {self.output}")
+
+
+@dataclass
 class PathOf:
     """Print the folder of a committed checkpoint."""
 

@@ -1,6 +1,7 @@
 """Two ranks of gloo compute what one process does with the doubled batch."""
 
 import os
+import socket
 import subprocess
 import sys
 
@@ -66,9 +67,9 @@ def everything(car_cache, car_tokens):
     return found | {actions: learn_reachability(car_cache, actions) for actions in ACTIONS}
 
 
-def _rank(rank, folder, roots):
+def _rank(rank, folder, roots, port):
     torch.set_num_threads(1)
-    dist.init_process_group("gloo", init_method=f"file://{folder}/meeting", rank=rank, world_size=2)
+    dist.init_process_group("gloo", init_method=f"tcp://127.0.0.1:{port}", rank=rank, world_size=2)
     torch.save(everything(*roots), folder / f"{rank}.pt")
     dist.destroy_process_group()
 
@@ -81,7 +82,9 @@ def one(cache_root, token_root):
 @pytest.fixture(scope="module")
 def two(cache_root, token_root, tmp_path_factory):
     folder = tmp_path_factory.mktemp("ranks")
-    mp.spawn(_rank, (folder, (cache_root, token_root)), nprocs=2)
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    mp.spawn(_rank, (folder, (cache_root, token_root), port), nprocs=2)
     return [torch.load(folder / f"{rank}.pt") for rank in range(2)]
 
 
@@ -103,15 +106,15 @@ def test_a_single_process_is_left_alone():
 
 def torchrun(*command):
     """Run a module in two processes that find each other; what the first printed."""
-    line = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2", "-m", *command]
+    line = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--local_addr=127.0.0.1", "--nproc_per_node=2", "-m"]
     environment = {**os.environ, "ACCELERATE_USE_CPU": "true", "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(line, env=environment, capture_output=True, text=True, timeout=300)
+    done = subprocess.run([*line, *command], env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-3000:]
     return done.stdout
 
 
 def distance(a, b):
-    return sum((a[key] - b[key]).float().square().sum() for key in a).sqrt()
+    return sum((a[key].float() - b[key].float()).square().sum() for key in a).sqrt()
 
 
 def test_lerobot_train_on_two_ranks_takes_the_steps_of_one(token_root, tmp_path):

@@ -144,8 +144,7 @@ class Tokens:
         vector = self.perception.basis(tokens).numpy()
         if self.dtype == "float16":
             return {"tokens": tokens.half().numpy(), "vector": vector}
-        scale = (tokens.abs().amax(-1, keepdim=True) / 127).clamp(min=1e-6).half()
-        rounded = (tokens / scale.float()).round().clamp(-127, 127).to(torch.int8)
+        rounded, scale = eight_bits(tokens)
         return {"tokens": rounded.numpy(), "tokens.scale": scale.numpy(), "vector": vector}
 
     def _tokens(self, images: dict[str, Tensor]) -> Tensor:
@@ -154,6 +153,12 @@ class Tokens:
         return torch.cat(
             [self.perception.tokens({k: v[at : at + ENCODED_AT_ONCE] for k, v in images.items()}) for at in parts]
         )
+
+
+def eight_bits(tokens: Tensor) -> tuple[Tensor, Tensor]:
+    """Tokens (..., C) as int8 and, for each token, the float16 scale (..., 1) that they are multiplied by."""
+    scale = (tokens.abs().amax(-1, keepdim=True) / 127).clamp(min=1e-6).half()
+    return (tokens / scale.float()).round().clamp(-127, 127).to(torch.int8), scale
 
 
 def build_frame_cache(
