@@ -582,7 +582,8 @@ class Report:
 class PictureFeatures:
     """Draw each variant of the bag beside the first three principal components of its patch features, as colours.
 
-    One basis for all: what has one colour everywhere looks the same to the encoder, whatever the bag is made of.
+    A camera has one basis for all variants: what has one colour in all of them looks the same to the encoder, whatever
+    the bag is made of.
     """
 
     encoder: str = "auto"

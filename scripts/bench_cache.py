@@ -4,8 +4,8 @@
     error     of tokens in 8 bits, relative to their norm: overall, and of the worst token
     speed     frames (of both cameras) that a CPU second brings as training windows: by LeRobotDataset, decoding video
               and resizing as training would, and from the cache: tokens in 16 bits, in 8 bits, principal components
-    memory    of `lerobot-train` on the cache and on ten copies of it in one: peak, anonymous memory, and pages of mapped
-              files, which the system takes back when it needs them
+    memory    of `lerobot-train` on the cache and on ten copies of it in one: peak, anonymous memory, and pages of
+              mapped files, which the system takes back when it needs them
 
 Speeds are taken in turn, on one thread, the first round thrown away; CPU time, user and system. Encoding, which the
 cache saves as well, is not counted. The 8-bit copy is made of the 16-bit tokens by the same function as `latentsafe
@@ -175,7 +175,7 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, required=True, help="its token cache, in 16 bits")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--length", type=int, default=24, help="frames of a window")
-    parser.add_argument("--windows", type=int, default=6, help="decoded a round; 20 times as many are read from a cache")
+    parser.add_argument("--windows", type=int, default=6, help="decoded a round; of a cache 20 times as many")
     parser.add_argument("--steps", type=int, default=100, help="of training, for its memory")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()

@@ -106,9 +106,10 @@ def test_a_single_process_is_left_alone():
 
 def torchrun(*command):
     """Run a module in two processes that find each other; what the first printed."""
-    line = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--local_addr=127.0.0.1", "--nproc_per_node=2", "-m"]
+    here = ["--standalone", "--local_addr=127.0.0.1", "--nproc_per_node=2"]
+    line = [sys.executable, "-m", "torch.distributed.run", *here, "-m", *command]
     environment = {**os.environ, "ACCELERATE_USE_CPU": "true", "OMP_NUM_THREADS": "1"}
-    done = subprocess.run([*line, *command], env=environment, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(line, env=environment, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-3000:]
     return done.stdout
 
@@ -126,6 +127,9 @@ def test_lerobot_train_on_two_ranks_takes_the_steps_of_one(token_root, tmp_path)
             "--policy.world_model.hidden=16", "--policy.world_model.units=16",
             f"--dataset.repo_id={tiny.REPO_ID}", f"--dataset.root={token_root}", f"--output_dir={tmp_path / name}",
             f"--batch_size={batch_size}", "--steps=3", "--save_freq=1", "--num_workers=0", "--seed=1",
+            # Adam divides gradients by their size: where they are next to nothing, it sees rounding errors.
+            "--use_policy_training_preset=false", "--optimizer.type=sgd", "--optimizer.lr=0.01",
+            "--scheduler.type=constant_with_warmup", "--scheduler.num_warmup_steps=0",
         )  # fmt: skip
 
     torchrun("lerobot.scripts.lerobot_train", *options("two", 4))
@@ -134,7 +138,7 @@ def test_lerobot_train_on_two_ranks_takes_the_steps_of_one(token_root, tmp_path)
     def weights(name, step):
         return load_file(tmp_path / name / "checkpoints" / f"{step:06d}" / "pretrained_model" / "model.safetensors")
 
-    assert distance(weights("one", 3), weights("two", 3)) < 0.01 * distance(weights("one", 3), weights("one", 1))
+    assert distance(weights("one", 3), weights("two", 3)) < 1e-3 * distance(weights("one", 3), weights("one", 1))
     last = LatentSafePolicy.from_pretrained(tmp_path / "two" / "checkpoints" / "last" / "pretrained_model")
     assert last.config.stage == "world_model"
 
