@@ -71,6 +71,7 @@ class LatentSafePolicy(PreTrainedPolicy):
         self.register_buffer("kept", kept, persistent=False)
         self.critic = self.new_critic(candidates)
         self.imagination = LatentImagination(self.world_model, self.margin, self.kept)
+        self._ddp_params_and_buffers_to_ignore = self._never_averaged()
         self._base: list[BasePolicy] = []  # in a list, so that its weights are not ours
         self.shield = Shield(self)
         if config.base_policy_path:
@@ -121,6 +122,15 @@ class LatentSafePolicy(PreTrainedPolicy):
 
     def get_optim_params(self) -> list:
         return [*self.world_model.parameters(), *self.margin.parameters()]
+
+    def _never_averaged(self) -> list[str]:
+        """What torch's DistributedDataParallel, which reads this list, need not send around at every step.
+
+        That is the critic, which this stage does not train, and all buffers, which are the same on every rank.
+        """
+        trained = {id(p) for p in self.get_optim_params()}
+        untrained = [name for name, p in self.named_parameters() if id(p) not in trained]
+        return [*untrained, *(name for name, _ in self.named_buffers())]
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
         """World-model loss plus the weighted hinge loss of the margin (Eq. 3)."""

@@ -3,7 +3,8 @@
     size      bytes a frame of two cameras: the videos, tokens in 16 and in 8 bits, and principal components
     error     of tokens in 8 bits, relative to their norm: overall, and of the worst token
     speed     frames (of both cameras) that a CPU second brings as training windows: by LeRobotDataset, decoding video
-              and resizing as training would, and from the cache: tokens in 16 bits, in 8 bits, principal components
+              and resizing as training would; and from the cache, where LeRobotDataset brings the frame's index and
+              numbers and the cache a window of tokens in 16 bits, in 8 bits, or of principal components
     memory    of `lerobot-train` on the cache and on ten copies of it in one: peak, anonymous memory, and pages of
               mapped files, which the system takes back when it needs them
 
@@ -42,6 +43,7 @@ from lerobot_latentsafe.datasets.frame_cache import (
     to_model_images,
 )
 from lerobot_latentsafe.evaluation.rollouts import provenance, write_json
+from lerobot_latentsafe.memory import keep_freed_memory
 
 COPIES = 10
 TRAIN = (
@@ -96,8 +98,14 @@ def readers(args: argparse.Namespace, wide: FrameCache, narrow: FrameCache) -> d
             for key in meta.camera_keys:
                 to_model_images(item[key], wide.image_size)
 
+    items = LeRobotDataset("local/cache", root=args.cache)
+
     def cached(cache: FrameCache, name: str) -> Callable[[np.ndarray], None]:
-        return lambda starts: cache.frames(starts[:, None] + np.arange(args.length), [name])
+        def read(starts: np.ndarray) -> None:
+            index = np.array([int(items[int(start)]["index"]) for start in starts])
+            cache.frames(index[:, None] + np.arange(args.length), [name])
+
+        return read
 
     few, many = args.windows, 20 * args.windows
     return {
@@ -180,6 +188,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     torch.set_num_threads(1)
+    keep_freed_memory()  # as training does
     wide = FrameCache.open(args.cache)
     n = len(wide.state)
     with tempfile.TemporaryDirectory() as folder:

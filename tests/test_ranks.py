@@ -44,7 +44,8 @@ def train_world_model(root, name):
         optimizer.step()
         losses.append(ranks.mean_over_ranks(torch.tensor([loss.item(), metrics["loss_margin"]])))
     assert policy.config.stage == "world_model"
-    return {"losses": torch.stack(losses), **policy.state_dict()}
+    weights = {name: w for name, w in policy.state_dict().items() if not name.startswith("critic")}
+    return {"losses": torch.stack(losses), **weights}
 
 
 def learn_reachability(root, actions):

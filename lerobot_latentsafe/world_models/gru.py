@@ -121,11 +121,12 @@ class FrameGRU(WorldModel):
             rows.append(self.features(latent))
         counts = (clip.valid & ~clip.is_first)[..., None].float()
         counts[:, 1:] *= clip.valid[:, :-1, None]
+        names = ("state",) if self.config.blind else ("vector", "state")
+        changes = [torch.diff(seen[name], dim=1, prepend=seen[name][:, :1]).square() * counts for name in names]
+        units = mean_over_ranks(torch.stack([change.sum() for change in changes])).clamp(min=1e-6)
         losses = {}
-        for name in ("state",) if self.config.blind else ("vector", "state"):
-            truth = seen[name]
-            change = torch.diff(truth, dim=1, prepend=truth[:, :1]).square() * counts
-            error = (torch.stack([z[name] for z in predicted], 1) - truth).square() * counts
-            losses[f"loss_{name}"] = error.sum() / mean_over_ranks(change.sum()).clamp(min=1e-6)
+        for name, unit in zip(names, units):
+            error = (torch.stack([z[name] for z in predicted], 1) - seen[name]).square() * counts
+            losses[f"loss_{name}"] = error.sum() / unit
         metrics = {name: value.item() for name, value in losses.items()}
         return sum(losses.values()), torch.stack(rows, 1), metrics
