@@ -2,7 +2,9 @@
 
     world_model     gradient steps on clips from a token cache, with DistributedDataParallel as LeRobot sets it up
     reachability    `refresh` updates of the critic and the imagination of a part of its pool, as in
-                    `latentsafe train-reachability`; two ranks have a batch and a pool of twice the size
+                    `latentsafe train-reachability`; two ranks have a batch and a pool of twice the size. With the
+                    batch of the configuration, and with one of 2048 states a rank: an update is over in a few
+                    milliseconds, and gradients must travel after each
 
 Three teams wait in processes of their own and work in turn: one process alone; two ranks of gloo; and, as the ceiling
 that this machine sets (shared caches, memory and clock), two processes that know nothing of each other. What counts is
@@ -33,7 +35,7 @@ from lerobot_latentsafe.memory import keep_freed_memory
 from lerobot_latentsafe.reachability import LatentReachability
 from lerobot_latentsafe.training import encoded_starts, load_with_cache
 
-TASKS = ("world_model", "reachability")
+TASKS = ("world_model", "reachability", "reachability_2048")
 TEAMS = {"one": 1, "two": 2, "two_alone": 2}
 """Team -> its processes."""
 
@@ -59,11 +61,15 @@ def training_steps(args: argparse.Namespace) -> Callable[[], int]:
     return work
 
 
-def reachability_steps(args: argparse.Namespace) -> Callable[[], int]:
-    """Updates of the critic, imagining anew a part of its pool; returns the states that all ranks backed up."""
+def reachability_steps(args: argparse.Namespace, batch_size: int | None = None) -> Callable[[], int]:
+    """Updates of the critic, imagining anew a part of its pool; returns the states that all ranks backed up.
+
+    Args:
+        batch_size: of a rank; None takes the configuration's.
+    """
     policy, reader = load_with_cache(args.policy, metadata(args))
     config = policy.config.reachability
-    config.batch_size *= ranks.world_size()
+    config.batch_size = (batch_size or config.batch_size) * ranks.world_size()
     config.pool = config.kept * 1024 * ranks.world_size()  # a chunk of 1024 starts a rank
     generator = torch.Generator().manual_seed(0)
     starts = encoded_starts(policy, reader, generator, max_frames=5000)
@@ -88,7 +94,8 @@ def process(orders: Connection, args: argparse.Namespace, team: str, rank: int, 
     keep_freed_memory()
     if team == "two":
         dist.init_process_group("gloo", init_method=f"tcp://127.0.0.1:{port}", rank=rank, world_size=2)
-    tasks = {"world_model": training_steps(args), "reachability": reachability_steps(args)}
+    work = (training_steps(args), reachability_steps(args), reachability_steps(args, 2048))
+    tasks = dict(zip(TASKS, work))
     orders.send(0)
     while (task := orders.recv()) is not None:
         orders.send(tasks[task]())
@@ -148,7 +155,7 @@ def main() -> None:
         rate = {team: values[1:] for team, values in rates[task].items()}  # the first round warms up
         for team in ("two", "two_alone"):
             row[f"{task}_{team}_over_one"] = spread([a / b for a, b in zip(rate[team], rate["one"])])
-            print(f"{task:13s} {team:10s}", *(f"{k} {v:.2f}" for k, v in row[f"{task}_{team}_over_one"].items()))
+            print(f"{task:17s} {team:10s}", *(f"{k} {v:.2f}" for k, v in row[f"{task}_{team}_over_one"].items()))
         row[f"{task}_a_second"] = {team: spread(values) for team, values in rate.items()}
     if args.json:
         write_json(args.json, {**row, "torch": torch.__version__, **provenance([0])})
