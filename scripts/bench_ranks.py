@@ -8,7 +8,8 @@
 
 Three teams wait in processes of their own and work in turn: one process alone; two ranks of gloo; and, as the ceiling
 that this machine sets (shared caches, memory and clock), two processes that know nothing of each other. What counts is
-wall time, so run it on a machine that does nothing else; the load before the run is noted.
+wall time, so run it on a machine that does nothing else; the load before the run is noted. `fastest` compares the
+fastest rounds, which others on the machine have disturbed least.
 
     OMP_NUM_THREADS=1 python scripts/bench_ranks.py --policy=data/margin_gru_0 --cache=data/held_branches_tokens \\
         --json=results/bag/bench_ranks.json
@@ -154,7 +155,8 @@ def main() -> None:
     for task in TASKS:
         rate = {team: values[1:] for team, values in rates[task].items()}  # the first round warms up
         for team in ("two", "two_alone"):
-            row[f"{task}_{team}_over_one"] = spread([a / b for a, b in zip(rate[team], rate["one"])])
+            ratios = spread([a / b for a, b in zip(rate[team], rate["one"])])
+            row[f"{task}_{team}_over_one"] = {**ratios, "fastest": max(rate[team]) / max(rate["one"])}
             print(f"{task:17s} {team:10s}", *(f"{k} {v:.2f}" for k, v in row[f"{task}_{team}_over_one"].items()))
         row[f"{task}_a_second"] = {team: spread(values) for team, values in rate.items()}
     if args.json:

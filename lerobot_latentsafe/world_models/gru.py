@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from lerobot_latentsafe.ranks import from_first_rank, mean_over_ranks
+from lerobot_latentsafe.ranks import mean_over_ranks
 from lerobot_latentsafe.world_models.base import Clip, Latent, WorldModel, WorldModelConfig, replace_rows
 from lerobot_latentsafe.world_models.perception import Perception, PerceptionConfig
 
@@ -108,7 +108,7 @@ class FrameGRU(WorldModel):
     def loss(self, clip: Clip) -> tuple[Tensor, Tensor, dict[str, float]]:
         """Squared errors of all predicted frames, in units of what changes from one frame to the next."""
         length = clip.state.shape[1]
-        observed = int(from_first_rank(torch.randint(1, self.config.observed + 1, (), device=clip.state.device)))
+        observed = int(torch.randint(1, self.config.observed + 1, ()))
         seen = {**clip.percepts, "state": clip.state}
         latent = start = self.initial(len(clip.state))
         predicted, rows = [], []
