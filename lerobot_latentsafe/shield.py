@@ -103,7 +103,7 @@ class Shield:
             within_s: how long ago that decision may be, seconds.
         """
         for other in _shields - {self}:
-            fresh = other.decided_at is not None and 0 <= other.clock() - other.decided_at <= within_s
+            fresh = other.decided_at is not None and 0 <= self.clock() - other.decided_at <= within_s
             if fresh and torch.equal(other.decision.action.cpu(), action) and self._no_stricter_than(other):
                 self.latent, self.executed = other.latent, other.executed
                 self.decision, self.decided_at = other.decision, other.decided_at
