@@ -185,6 +185,8 @@ def train_reachability(
     generator = torch.Generator(device="cpu").manual_seed(seed)
     if not policy.critic.discrete:
         policy.config.fallback_low, policy.config.fallback_high = covered_actions(policy, reader, config.coverage)
+    policy.world_model.requires_grad_(False)
+    policy.margin.requires_grad_(False)
     policy.critic = policy.new_critic(policy.critic.candidates)
     started = time.process_time()
     starts = encoded_starts(policy, reader, generator)
