@@ -94,8 +94,8 @@ class ReachabilityConfig:
         steps: gradient steps.
         batch_size: imagined states a gradient step; with discrete actions each is backed up under all of them.
         lr, actor_lr: AdamW step sizes, decayed over the second half.
-        actor_through: what a continuous actor climbs: `critic`, Q(z, a) of the states in the pool; or `world_model`, the
-            value of the latent that the world model predicts, through its gradient.
+        actor_through: what a continuous actor climbs: `critic`, Q(z, a) of the states in the pool; or `world_model`,
+            the value of the latent that the world model predicts, through its gradient.
         gamma: the final discount; 1 - gamma is annealed from `gamma_start` geometrically over `anneal` of the run,
             after `warmup` of the run at gamma = 0.
         caution: weight of overestimates of V in the squared error, relative to underestimates.
