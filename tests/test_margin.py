@@ -62,7 +62,7 @@ def test_it_learns_a_disc():
         optimizer.zero_grad()
         hinge_loss(margin(points), failure).backward()
         optimizer.step()
-    assert ((margin(points) < 0) == failure.bool()).float().mean() > 0.97
+    assert ((margin(points) < 0) == failure.bool()).float().mean() > 0.95
 
 
 def test_fitted_margin_separates_and_tanh_still_resolves_it():
@@ -76,5 +76,5 @@ def test_fitted_margin_separates_and_tanh_still_resolves_it():
     fit_margin(margin, features, failure, 0.75, generator, steps=300)
     with torch.no_grad():
         l = margin(features)
-    assert ((l < 0) == (failure == 1)).float().mean() > 0.97
+    assert ((l < 0) == (failure == 1)).float().mean() > 0.95
     assert l.abs().median().item() == pytest.approx(1.0, abs=1e-3)
