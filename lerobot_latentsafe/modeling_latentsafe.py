@@ -118,6 +118,19 @@ class LatentSafePolicy(PreTrainedPolicy):
         still = torch.zeros_like(middle).clamp(self.action_low, self.action_high)
         return torch.where(self.action_varies, still, middle).repeat(batch_size, 1)
 
+    def commands_seen(self, state: Tensor) -> Tensor:
+        """What a normalised state (B, S) tells of commands of the same name, such as `gripper.pos`.
+
+        Returns:
+            (B, A) in robot units, in range; NaN for commands that the state does not tell.
+        """
+        names, seen = self.config.state_names or [], state.new_full((len(state), len(self.action_low)), torch.nan)
+        for i, name in enumerate(self.config.action_names or []):
+            if name in names:
+                j = names.index(name)
+                seen[:, i] = state[:, j] * self.state_std[j] + self.state_mean[j]
+        return seen.clamp(self.action_low, self.action_high)
+
     # -- training (stage 1) ---
 
     def get_optim_params(self) -> list:

@@ -321,6 +321,23 @@ def test_fallback_keeps_its_grip(cache_meta, tmp_path):
     assert policy.shield(seen, torch.full((1, 2), torch.nan)).action[0, 0] == pytest.approx(0.7, abs=1e-5)
 
 
+def test_before_anything_was_executed_the_grip_is_that_which_is_seen(tmp_path):
+    """A kept command whose name the state has, in the same unit."""
+    from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+    from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, STATE_NAMES
+
+    policy = LatentSafePolicy.from_pretrained(tiny.save_franka_filter(tmp_path / "filter", epsilon=2.0))
+    assert "gripper.pos" in STATE_NAMES
+    state = torch.zeros(2, len(STATE_NAMES))
+    state[:, STATE_NAMES.index("gripper.pos")] = torch.tensor([0.8, 1.2])  # beyond what can be commanded
+    images = {f"observation.images.{name}": torch.rand(2, 3, 32, 32) for name in ("front", "wrist")}
+    nothing, broken = None, torch.full((2, len(ACTION_NAMES)), torch.nan)
+    for proposed in (nothing, broken):
+        policy.shield.reset()
+        decision = policy.shield({**images, "observation.state": state}, proposed)
+        torch.testing.assert_close(decision.action[:, ACTION_NAMES.index("gripper.pos")], torch.tensor([0.8, 1.0]))
+
+
 @pytest.mark.parametrize("law", ["plan", "margin"])
 def test_baseline_laws_need_no_critic(tiny_world_model, law):
     from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, UntrainedFilterError

@@ -138,6 +138,19 @@ def test_joint_moves_are_held_back_unless_allowed(trained, caplog):
         assert set(robot.send_action(joints)) == set(joints)
 
 
+@pytest.mark.parametrize("opening", [1.0, 0.4])
+def test_at_the_first_tick_the_grip_is_held_as_it_is_seen(robot, opening):
+    """Nothing was executed yet, and nothing that could be is proposed: 0 would close the fingers."""
+    seen = robot.inner.get_observation()
+    seen["gripper.pos"] = opening
+    robot.inner.get_observation = lambda: seen
+    sent = robot.send_action(PUSH | {"delta_x.pos": float("nan")})
+    assert last(robot).intervened.item() and sent["gripper.pos"] == pytest.approx(opening, abs=1e-5)
+    robot._forget()
+    robot._sent.clear()
+    assert robot.send_action({"joint_1.pos": 0.1}) == pytest.approx(STILL | {"gripper.pos": opening})
+
+
 def test_what_stays_closed_stays_closed_through_moves_of_other_names(robot):
     robot.get_observation()
     robot.send_action(PUSH | {"gripper.pos": 0.25})

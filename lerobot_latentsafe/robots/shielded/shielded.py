@@ -241,7 +241,9 @@ class LatentSafeShielded(Robot):
             "the robot holds still. --robot.unfiltered_moves=true lets such moves pass unfiltered"
         )
         self._decided_at = -math.inf
-        config, now = self.filter.config, {**(self._observation or {}), **self._sent}
+        if self._observation is None:
+            self.get_observation()
+        config, now = self.filter.config, {**self._observation, **self._sent}
         still = dict(zip(config.action_names, self.filter.hold_action(1)[0].tolist()))
         return {**still, **{name: float(now[name]) for name in config.kept_commands if name in now}}
 
