@@ -334,13 +334,13 @@ def test_lerobots_own_commands_take_the_shielded_robot(trained, tmp_path, monkey
     }  # fmt: skip
     monkeypatch.setattr("sys.argv", ["lerobot-replay", *shielded_options(trained, **replayed)])
     lerobot_replay.main()
-    from lerobot_latentsafe.robots.shielded.journal import decision_columns
+    import pyarrow.parquet as pq
 
     dataset = LeRobotDataset("me/shielded", root=root)
     frames = int((np.array(dataset.hf_dataset["episode_index"]) == 0).sum())
-    found = decision_columns(journal, np.zeros(frames, int), np.arange(frames))
-    assert found["intervened"].all()
-    assert np.allclose(found["proposed"], np.array(dataset.hf_dataset["action"])[:frames], atol=1e-6)
+    rows = pq.read_table(journal).to_pylist()
+    assert [r["frame_index"] for r in rows] == list(range(frames)) and all(r["intervened"] for r in rows)
+    assert np.allclose([r["proposed"] for r in rows], np.array(dataset.hf_dataset["action"])[:frames], atol=1e-6)
 
 
 def test_a_journal_goes_on_and_forgets_what_is_recorded_again(tmp_path):
@@ -354,7 +354,7 @@ def test_a_journal_goes_on_and_forgets_what_is_recorded_again(tmp_path):
         journal.hear(announced)
         for value in values:
             judged = least_restrictive(torch.zeros(1, 2), torch.ones(1, 2), torch.tensor([value]), torch.ones(1), 0.0)
-            journal.add(judged)
+            journal.add(judged, [0.0, 1.0])
 
     path = tmp_path / "shield" / "decisions.parquet"
     first = Journal(path)
@@ -372,15 +372,32 @@ def test_a_journal_goes_on_and_forgets_what_is_recorded_again(tmp_path):
     assert rows == [(0, 0, 0.5, "passed"), (0, 1, -0.5, "unsafe_value"), (1, 0, 0.7, "passed")]
 
 
+def frames_of(*actions):
+    """An episode as a dataset stores it."""
+    n = len(actions)
+    return {"episode_index": np.zeros(n, int), "frame_index": np.arange(n), "action": np.array(actions, np.float32)}
+
+
 def test_decisions_of_another_dataset_are_refused(tmp_path):
-    from lerobot_latentsafe.robots.shielded.journal import decision_columns
+    from lerobot_latentsafe.filter import least_restrictive
+    from lerobot_latentsafe.robots.shielded.journal import Journal, decision_columns
 
     with pytest.raises(FileNotFoundError, match="latentsafe record"):
-        decision_columns(tmp_path / "none.parquet", np.zeros(1, int), np.zeros(1, int))
+        decision_columns(tmp_path / "none.parquet", frames_of([0.0, 1.0]))
     torn = tmp_path / "torn.parquet"
     torn.write_bytes(b"PAR1")
     with pytest.raises(ValueError, match="not a readable journal"):
-        decision_columns(torn, np.zeros(1, int), np.zeros(1, int))
+        decision_columns(torn, frames_of([0.0, 1.0]))
+    journal = Journal(tmp_path / "decisions.parquet")
+    judged = least_restrictive(torch.zeros(1, 2), torch.ones(1, 2), torch.ones(1), torch.ones(1), 0.0)
+    for executed in ([0.0, 1 / 3], [0.5, 1.0]):
+        journal.add(judged, executed)
+    journal.write()
+    assert decision_columns(journal.path, frames_of([0.0, 1 / 3], [0.5, 1.0]))["value"].tolist() == [1.0, 1.0]
+    with pytest.raises(ValueError, match=r"no decision for episode 0, frame 2.*another dataset"):
+        decision_columns(journal.path, frames_of([0.0, 1 / 3], [0.5, 1.0], [0.5, 1.0]))
+    with pytest.raises(ValueError, match=r"\[0\.5, 1\.0\] was executed in episode 0, frame 1.*another dataset"):
+        decision_columns(journal.path, frames_of([0.0, 1 / 3], [0.5, 0.9]))
 
 
 @pytest.fixture

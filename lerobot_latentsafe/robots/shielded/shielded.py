@@ -170,9 +170,12 @@ class LatentSafeShielded(Robot):
         early, self._sent_early = self._sent_early, None
         if early is not None and action == early:
             return early
+        shield, names = self.filter.shield, self.filter.config.action_names
+        before = shield.decision
         sent = self.inner.send_action(self._decide(action))
         self._sent.update(sent)
-        shield, names = self.filter.shield, self.filter.config.action_names
+        if self.journal and shield.decision is not None and shield.decision is not before:
+            self.journal.add(shield.decision, [float(sent[name]) for name in names])
         if set(sent) == set(names) and shield.executed is not None:  # the robot may have clipped it
             executed = torch.tensor([[float(sent[name]) for name in names]], device=self.filter.device)
             shield.executed = self.filter.normalise_action(executed).nan_to_num(0.0).clamp(-1, 1)
@@ -223,9 +226,7 @@ class LatentSafeShielded(Robot):
         return isinstance(self._phase, str)
 
     def _carry_out(self, decision: FilterDecision, action: dict[str, float]) -> dict[str, float]:
-        """The action of a decision on an action, noted in the journal."""
-        if self.journal:
-            self.journal.add(decision)
+        """The action of a decision on an action."""
         if not decision.intervened.item():
             return action
         if isinstance(self._phase, int) and not self._early:
