@@ -322,6 +322,7 @@ def adopt_dataset(config: LatentSafeConfig, meta, stats: dict) -> None:
                 "train a new filter or use a dataset recorded with the same robot and rate"
             )
         setattr(config, name, value)
+    config.robot_type = config.robot_type or meta.robot_type
     if config.action_low is None:
         low, high = _list(stats["action"]["min"]), _list(stats["action"]["max"])
         config.action_varies = [h - l > 1e-6 for l, h in zip(low, high)]
