@@ -16,6 +16,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from lerobot_latentsafe.checkpoint import TRAINED
+from lerobot_latentsafe.datasets.frame_cache import check_proportions
 from lerobot_latentsafe.filter import FilterDecision, Reason, least_restrictive
 from lerobot_latentsafe.world_models.base import Latent, replace_rows
 
@@ -147,6 +148,7 @@ class Shield:
         finite = torch.isfinite(state).all(-1)
         for key in model.world_model.image_keys:
             image = observation[key].to(model.device)
+            check_proportions(key, tuple(image.shape[1:]), config.input_features[key].shape)
             finite &= torch.isfinite(image).flatten(1).all(1)
             in_range = (image >= -1e-3).flatten(1).all(1) & (image <= 1 + 1e-3).flatten(1).all(1)
             finite &= in_range

@@ -168,6 +168,18 @@ def test_image_in_bytes_is_not_taken_for_one_in_0_to_1(permissive):
     assert permissive.shield(observation, actions(LEFT)).intervened.all()
 
 
+@pytest.mark.parametrize("shape", [(3, 3, 128, 96), (3, 1, 128, 128), (3, 128, 128, 3)])
+def test_image_of_other_proportions_is_refused(permissive, shape):
+    observation = {**along(1)[0], IMAGE: torch.rand(shape)}
+    with pytest.raises(ValueError, match=r"observation\.image has shape .*trained on \(3, \d+, \d+\).*crop"):
+        permissive.shield(observation, actions(LEFT))
+
+
+def test_image_of_another_size_is_averaged(permissive):
+    observation = {**along(1)[0], IMAGE: torch.rand(3, 3, 64, 64)}
+    assert permissive.shield(observation, actions(LEFT)).reason.eq(Reason.PASSED).all()
+
+
 @pytest.mark.parametrize(
     ("age_s", "stale"), [(0.0, False), (0.05, False), (0.051, True), (-0.01, True), (math.nan, True)]
 )

@@ -253,23 +253,28 @@ def test_shields_do_not_nest(trained, capsys):
     assert "invalid choice: 'latentsafe_shielded'" in capsys.readouterr().err
 
 
+def seen(**cameras):
+    """Input features of a filter whose pictures have these shapes."""
+    from lerobot.configs.types import FeatureType, PolicyFeature
+
+    images = {f"observation.images.{name}": PolicyFeature(FeatureType.VISUAL, shape) for name, shape in cameras.items()}
+    return {**images, "observation.state": PolicyFeature(FeatureType.STATE, (len(STATE_NAMES),))}
+
+
+SQUARE = (3, 32, 32)
+SIDE = {"cameras": ["observation.images.front", "observation.images.side"]}
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"cameras": ["observation.images.front", "observation.images.side"]}, "no camera side"),
+        ({**SIDE, "input_features": seen(front=SQUARE, side=SQUARE)}, "no camera side"),
+        ({"input_features": seen(front=SQUARE, wrist=(3, 24, 32))}, r"wrist has shape \(3, 32, 32\).*\(3, 24, 32\)"),
         ({"action_names": [*ACTION_NAMES[:-1], "hand.pos"], "kept_commands": []}, "acts in"),
         ({"state_names": [*STATE_NAMES[:-1], "weight.pos"]}, "does not observe weight.pos"),
     ],
 )
 def test_a_filter_of_another_robot_is_refused_before_anything_moves(tmp_path, changes, words):
-    from lerobot.configs.types import FeatureType, PolicyFeature
-
-    if "cameras" in changes:
-        image = PolicyFeature(FeatureType.VISUAL, (3, 32, 32))
-        changes["input_features"] = {
-            **dict.fromkeys(changes["cameras"], image),
-            "observation.state": PolicyFeature(FeatureType.STATE, (len(STATE_NAMES),)),
-        }
     other = tiny.save_franka_filter(tmp_path / "other", **changes)
     with pytest.raises(ValueError, match=words):
         make_robot_from_config(config(other))

@@ -15,6 +15,7 @@ from lerobot.robots.utils import make_robot_from_config
 from lerobot.utils.constants import OBS_IMAGES, OBS_STATE, OBS_STR
 from lerobot.utils.feature_utils import build_dataset_frame
 
+from lerobot_latentsafe.datasets.frame_cache import check_proportions
 from lerobot_latentsafe.filter import FilterDecision, Reason
 from lerobot_latentsafe.robots.announcements import Announcements
 from lerobot_latentsafe.robots.shielded.config_shielded import LatentSafeShieldedConfig
@@ -75,6 +76,9 @@ class LatentSafeShielded(Robot):
                 f"{', '.join(wanted)}, the robot has {', '.join(cameras) or 'none'}. Name its cameras alike, or "
                 "train a filter for this robot"
             )
+        for name in wanted:
+            key, (height, width, channels) = f"{OBS_IMAGES}.{name}", robot.observation_features[name]
+            check_proportions(key, (channels, height, width), config.input_features[key].shape)
         acts_in, offered = set(config.action_names), set(robot.action_features)
         if acts_in != offered:
             raise ValueError(
