@@ -19,29 +19,19 @@ OPERATORS = {"closed_end": "pulls the closed end up", "open_end": "lifts the ope
 
 def run(demo: Demo, filter: str, base: str, law: str, n: int) -> None:
     """Both experiments, side by side on two cores."""
-    steps = [
-        (
-            f"diffusion policy: {n} starts bare, the same {n} shielded",
-            *("python", "scripts/bag_policies.py", f"--weak={base}", "--filters", filter, "--laws", law, f"--n={n}"),
-            *("--n_videos=3", f"--output={demo.out}/policies.json"),
-        ),
-        (
-            f"operators: {n // 2} lifts by each end, bare and shielded",
-            *(
-                "python",
-                "scripts/bag_operators.py",
-                f"--policy={filter}",
-                "--operators",
-                *OPERATORS,
-                "--laws",
-                "bare",
-                law,
-            ),
-            *(f"--n={max(1, n // 2)}", f"--output={demo.out}/operators.json"),
-        ),
-    ]
-    with ThreadPoolExecutor(len(steps)) as cores:
-        for done in [cores.submit(demo.run, *step) for step in steps]:
+    few = max(1, n // 2)
+    policies = (
+        f"diffusion policy: {n} starts, bare and shielded",
+        *("python", "scripts/bag_policies.py", f"--weak={base}", "--filters", filter, "--laws", law),
+        *(f"--n={n}", "--n_videos=3", f"--output={demo.out}/policies.json"),
+    )
+    operators = (
+        f"operators: {few} lifts by either end, bare and shielded",
+        *("python", "scripts/bag_operators.py", f"--policy={filter}", "--laws", "bare", law, "--operators"),
+        *(*OPERATORS, f"--n={few}", f"--output={demo.out}/operators.json"),
+    )
+    with ThreadPoolExecutor(2) as cores:
+        for done in [cores.submit(demo.run, *step) for step in (policies, operators)]:
             done.result()
 
 
