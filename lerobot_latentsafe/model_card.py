@@ -174,5 +174,5 @@ def _rates(content: dict, law: str, path: tuple[str, ...] = ()) -> Iterator[tupl
                 yield (*path, name.replace("_", " ")), share(entry)
         else:
             yield from _rates(entry, law, (*path, name))
-            if "overridden_share" in entry:
+            if "overridden_share" in entry and name != "bare":
                 yield (*path, name, "steps overridden"), f"{entry['overridden_share']:.1%}"
