@@ -4,7 +4,8 @@
     scripts/bag_operators.py --policy=<filter> --operators closed_end open_end --n=100
 
 Writes results/bag/operators.json: for each operator and law the episodes that spill, the share of candies lost, steps
-overridden, the step of the first override, and the CPU time of a decision.
+overridden, the step of the first override, the CPU time of a decision, and the values of a few episodes step by step;
+operators.png beside it draws those of the first law that filters.
 """
 
 import argparse
@@ -14,7 +15,8 @@ import numpy as np
 import torch
 
 from lerobot_latentsafe.envs.bag import BagScene
-from lerobot_latentsafe.evaluation.bag import FIRST_SEED, drive, summary
+from lerobot_latentsafe.evaluation.bag import FIRST_SEED, drive, in_short, summary, traces
+from lerobot_latentsafe.evaluation.figures import save, value_profiles
 from lerobot_latentsafe.evaluation.rollouts import provenance, write_json
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.teleoperators.scripted.behaviors import begin
@@ -38,8 +40,9 @@ def episode(scene: BagScene, operator: str, seed: int, policy: LatentSafePolicy 
 
 
 def cell(scene: BagScene, operator: str, n: int, policy: LatentSafePolicy | None) -> dict:
-    """All episodes of an operator under one law."""
-    return summary([episode(scene, operator, FIRST_SEED + i, policy) for i in range(n)], scene.n_candies)
+    """All episodes of an operator under one law, and the traces of the first few."""
+    rows = [episode(scene, operator, FIRST_SEED + i, policy) for i in range(n)]
+    return {**summary(rows, scene.n_candies), "traces": traces(rows)}
 
 
 def main() -> None:
@@ -63,8 +66,10 @@ def main() -> None:
             if law != "bare":
                 policy.config.law = law
             table[f"{operator} {law}"] = row = cell(scene, operator, arguments.n, None if law == "bare" else policy)
-            shown = {k: row[k] for k in ("mean_share_lost", "overridden_share", "decision_cpu_ms") if k in row}
-            print(operator, law, f"spilled {row['spilled']['k']}/{arguments.n}", shown, flush=True)
+            print(operator, law, in_short(row), flush=True)
+    if filtering := [law for law in arguments.laws if law != "bare"]:
+        panels = {operator: table[f"{operator} {filtering[0]}"]["traces"] for operator in arguments.operators}
+        save(value_profiles(panels, policy.config.epsilon, scene.fps), arguments.output.with_suffix(".png"))
     row = {**table, "epsilon": policy.config.epsilon, "guard": policy.config.guard}
     write_json(arguments.output, {**row, **provenance(seeds=[FIRST_SEED, FIRST_SEED + arguments.n - 1])})
 

@@ -7,7 +7,7 @@ import torch
 from lerobot.envs import make_env, preprocess_observation
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_latentsafe.evaluation.rollouts import wilson
+from lerobot_latentsafe.evaluation.rollouts import paired_p_value, wilson
 from lerobot_latentsafe.filter import FilterDecision, Reason
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.shield import BasePolicy
@@ -169,20 +169,16 @@ def compare(policy: LatentSafePolicy, env: EnvConfig, n_episodes: int, seed: int
     Returns:
         bare, shielded: rates; violation_p_value: exact McNemar test on the pairs; episodes: both `Episodes`.
     """
-    from scipy.stats import binomtest
-
     check_environment(policy, env)
     if policy.base is None:
         raise ValueError("nothing to shield: give --base_policy_path, or a checkpoint written by latentsafe wrap")
     bare = run_episodes(policy.base, env, n_episodes, seed, n_videos=n_videos)
     shielded = run_episodes(policy, env, n_episodes, seed, n_videos=n_videos)
-    saved, caused = (bare.violation & ~shielded.violation).sum(), (~bare.violation & shielded.violation).sum()
-    p_value = binomtest(int(caused), int(saved + caused)).pvalue if saved + caused else 1.0
     reasons = np.bincount([r for t in shielded.traces for r in t["reason"]], minlength=len(Reason))
     return {
         "bare": bare.rates(),
         "shielded": shielded.rates(),
-        "violation_p_value": float(p_value),
+        "violation_p_value": paired_p_value(bare.violation, shielded.violation),
         "reasons": {reason.name.lower(): int(reasons[reason]) for reason in Reason if reasons[reason]},
         "episodes": {"bare": bare, "shielded": shielded},
     }
