@@ -8,8 +8,8 @@
 Fits fresh margins to the frozen features of a world model, as `latentsafe train-margin` does. In suggested order a
 person labels in rounds, each with suggestions of the margin fitted to the labels of the rounds before. For a clean
 result train the world model with --policy.margin_weight=0, so that no label has shaped its features; the JSON says
-whether it was. Labels come from the dataset's own column; the last fifth of the episodes is held out and scored frame
-by frame. All curves of the output's folder are drawn into curve.png beside them.
+whether it was. Labels come from the dataset's own column; a fifth of the episodes is held out and scored frame by
+frame. All curves of the output's folder are drawn into curve.png beside them.
 """
 
 import argparse
@@ -32,7 +32,8 @@ from lerobot_latentsafe.training import fit_margin, load_with_cache, seen_and_im
 
 SHARES = (0.02, 0.05, 0.1, 0.2, 1.0)
 """The rounds of labelling: share of the episodes that are labelled after each."""
-HELD_OUT = 0.2
+BLOCK = 10
+"""Every fifth block of so many episodes is held out: what was recorded together, such as branches, stays together."""
 
 
 class Study:
@@ -43,7 +44,8 @@ class Study:
         features, frame: (M, D) seen and imagined ones of random windows, (M,) their frames: what is fitted to.
         failure, episode: (N,) of every frame.
         first: frame at which each episode begins.
-        pool: how many episodes may be labelled; those after them are held out.
+        pool: episodes that may be labelled.
+        held_out: bool (N,), frames of the other episodes.
 
     Raises:
         ValueError: a frame without a label.
@@ -55,7 +57,9 @@ class Study:
         if (self.failure < 0).any():
             raise ValueError(f"{(self.failure < 0).sum()} frames have no label; this study needs a dataset with all")
         self.first = np.unique(self.episode, return_index=True)[1]
-        self.pool = round((1 - HELD_OUT) * len(self.first))
+        episodes = np.arange(len(self.first))
+        self.pool = episodes[episodes // BLOCK % 5 < 4]
+        self.held_out = ~np.isin(self.episode, self.pool)
         self.seen = encode(policy, reader, self.first)
         # A frame's number stands in for its label, so that labels can be put on and taken off later.
         numbered = dataclasses.replace(labels, failure=np.arange(len(self.failure)))
@@ -77,14 +81,14 @@ class Study:
     def curve(self, suggested: bool, seed: int) -> dict[str, float]:
         """Balanced accuracy on held-out frames after each round; what is labelled first is random either way."""
         order, margin, scores = np.random.default_rng(seed).permutation(self.pool), None, {}
-        held_out, labelled = self.episode >= self.pool, 0
+        labelled = 0
         for share in SHARES:
             if suggested and margin is not None:
                 useful = [Suggestion.of(l).usefulness for l in np.split(margin, self.first[1:])]
                 order[labelled:] = sorted(order[labelled:], key=lambda episode: -useful[episode])
-            labelled = round(share * self.pool)
+            labelled = max(1, round(share * len(order)))
             margin = self.fit(order[:labelled], seed)
-            scores[f"{share:g}"] = balanced_accuracy(margin[held_out] < 0, self.failure[held_out])
+            scores[f"{share:g}"] = balanced_accuracy(margin[self.held_out] < 0, self.failure[self.held_out])
         return scores
 
 
@@ -145,7 +149,7 @@ def main() -> None:
         "balanced_accuracy": curves,
         "lost_with_a_tenth": {o: float(np.mean([r["1"] - r["0.1"] for r in rows])) for o, rows in curves.items()},
         "labels_shaped_the_features": policy.config.margin_weight > 0,
-        "episodes": study.pool,
+        "episodes": len(study.pool),
         **provenance(arguments.seeds),
     }
     write_json(arguments.output, row)

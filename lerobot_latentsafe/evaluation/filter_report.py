@@ -208,10 +208,11 @@ def _charts(trace: dict[str, list], policy: LatentSafePolicy, fps: int, seconds:
     values = {"value of the wanted action": padded(trace["value"]), "margin now": padded(trace["margin"])}
     charts = [report.chart(values, fps, shaded, policy.config.epsilon, (-1.0, 1.0), "dashed: threshold")]
     proposed, executed = np.array(trace["proposed"]), np.array(trace["action"])
+    limits = list(zip(policy.config.action_low, policy.config.action_high))
     for j, name in enumerate(policy.config.action_names):
         if policy.config.action_varies[j]:
             commands = {f"{name} executed": padded(executed[:, j]), "wanted": padded(proposed[:, j])}
-            charts.append(report.chart(commands, fps, shaded))
+            charts.append(report.chart(commands, fps, shaded, limits=limits[j]))
     return charts
 
 
