@@ -35,6 +35,7 @@ class LatentSafeConfig(PreTrainedConfig):
         guard: steps for which the proposed action is imagined held before V is asked. 1 is the paper's law; more give
             room for what the world model gets wrong, as time, which a saturated margin cannot.
         calibration: the evidence epsilon was chosen on; written by `latentsafe calibrate`.
+        evaluation: what was measured -> the rate in words; written by `latentsafe push --results=...` for the card.
         lookahead: steps of imagination before the critic's value is read, 0 to 25: V and the fallback are the best of
             the critic's policy and of holding each action. 0 is the critic alone, and the cheapest.
         law: what V is: `reachability`; or a baseline that learns no value: `plan` imagines holding each action, and
@@ -43,6 +44,7 @@ class LatentSafeConfig(PreTrainedConfig):
         deadline_ms: if set, a decision that took longer is not trusted, and the fallback acts.
         base_policy_path: the policy to shield: a folder, a Hub id or the name of a committed checkpoint.
         cameras: the image features the filter reads, by default all of the dataset's.
+        robot_type: LeRobot's name of the robot that recorded the dataset.
         fps, state_names, action_names, action_low, action_high, state_mean, state_std: what the filter was trained
             on, in robot units; filled in from the dataset.
         kept_commands: actions that the fallback never changes, such as `gripper.pos`: it moves, but keeps its grip.
@@ -73,6 +75,7 @@ class LatentSafeConfig(PreTrainedConfig):
     epsilon: float = 0.0
     guard: int = 1
     calibration: dict[str, float] = field(default_factory=dict)
+    evaluation: dict[str, str] = field(default_factory=dict)
     lookahead: int = 15
     law: str = "reachability"
     mode: str = "filter"
@@ -80,6 +83,7 @@ class LatentSafeConfig(PreTrainedConfig):
     base_policy_path: str | None = None
 
     cameras: list[str] | None = None
+    robot_type: str | None = None
     fps: int | None = None
     state_names: list[str] | None = None
     action_names: list[str] | None = None

@@ -16,6 +16,7 @@ class Recording:
 
     Attributes:
         episode: (N,) of each frame.
+        executed: (N, A) the action of each frame.
         decisions: proposed (N, A), value, margin, intervened, reason (N,) of each frame; see `decision_columns`.
 
     Raises:
@@ -25,9 +26,9 @@ class Recording:
     def __init__(self, policy: LatentSafePolicy, frames: DatasetFrames):
         check_fit(policy, frames)
         self.policy, self.frames = policy, frames
-        index = read_frames(frames.root, ["frame_index"])
-        self.episode = index["episode_index"]
-        self.decisions = decision_columns(frames.root / FILE, self.episode, index["frame_index"])
+        stored = read_frames(frames.root, ["frame_index", "action"])
+        self.episode, self.executed = stored["episode_index"], stored["action"]
+        self.decisions = decision_columns(frames.root / FILE, stored)
 
     @staticmethod
     def is_one(frames: DatasetFrames) -> bool:
@@ -38,13 +39,12 @@ class Recording:
         """One episode; whether it succeeded or failed is not known here, and stands as no."""
         rows, no = self.episode == episode, np.zeros(1, bool)
         trace = {name: column[rows].tolist() for name, column in self.decisions.items()}
-        action = self.frames.columns(episode, ["action"])["action"]
-        change = np.linalg.norm(action - self.decisions["proposed"][rows], axis=-1)
+        change = np.linalg.norm(self.executed[rows] - self.decisions["proposed"][rows], axis=-1)
         latents, (length,) = encode_episodes(self.policy, self.frames, [episode])
         return Episodes(
             success=no, violation=no, steps=np.array([length]), overridden=np.array([sum(trace["intervened"])]),
             action_change=np.array([change.sum()]), severity=np.full(1, np.nan),
-            traces=[{**trace, "action": action.tolist()}],
+            traces=[{**trace, "action": self.executed[rows].tolist()}],
             frames=[list(self.frames.images(self.policy.config.cameras[0], episode))],
             latents=[[map_latent(latents, lambda z, t=t: z[:, t]) for t in range(length)]],
         )  # fmt: skip

@@ -8,7 +8,7 @@ from lerobot.envs import make_env, preprocess_observation
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_latentsafe.evaluation.album import Album
-from lerobot_latentsafe.evaluation.rollouts import wilson
+from lerobot_latentsafe.evaluation.rollouts import paired_p_value, wilson
 from lerobot_latentsafe.filter import FilterDecision, Reason
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.shield import BasePolicy
@@ -199,19 +199,15 @@ def compare(
     Returns:
         bare, shielded: rates; violation_p_value: exact McNemar test on the pairs; episodes: both `Episodes`.
     """
-    from scipy.stats import binomtest
-
     check_environment(policy, env)
     if policy.base is None:
         raise ValueError("nothing to shield: give --base_policy_path, or a checkpoint written by latentsafe wrap")
     bare = run_episodes(policy.base, env, n_episodes, seed, n_videos=n_videos, album=album)
     shielded = run_episodes(policy, env, n_episodes, seed, n_videos=n_videos, album=album)
-    saved, caused = (bare.violation & ~shielded.violation).sum(), (~bare.violation & shielded.violation).sum()
-    p_value = binomtest(int(caused), int(saved + caused)).pvalue if saved + caused else 1.0
     return {
         "bare": bare.rates(),
         "shielded": shielded.rates(),
-        "violation_p_value": float(p_value),
+        "violation_p_value": paired_p_value(bare.violation, shielded.violation),
         "reasons": count_reasons([reason for trace in shielded.traces for reason in trace["reason"]]),
         "episodes": {"bare": bare, "shielded": shielded},
     }
