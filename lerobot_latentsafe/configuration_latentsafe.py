@@ -123,6 +123,17 @@ class LatentSafeConfig(PreTrainedConfig):
         if self.margin_delta <= 0:
             raise ValueError(f"--policy.margin_delta is {self.margin_delta}; expected a positive number")
 
+    def override(self, options: object, *names: str) -> None:
+        """Take over those of these options that are given, as attributes that are not None.
+
+        Raises:
+            ValueError: what results is no configuration.
+        """
+        for name in names:
+            if getattr(options, name) is not None:
+                setattr(self, name, getattr(options, name))
+        self.__post_init__()
+
     @property
     def observation_delta_indices(self) -> list[int] | None:
         """Frames t .. t + T - 1; with a frame cache the policy cuts the window itself, from `index`."""
