@@ -30,8 +30,7 @@ VARIANTS = {
     "as configured": {},
     "16 components": {"components": 16},
     "caution 2": {"caution": 2.0},
-    "first 8 of 25 steps": {"kept": 8},
-    "all 25 steps": {"kept": 25},
+    "all 25 imagined steps learned on": {"kept": 25},
     "actor through the world model": {"actor_through": "world_model"},
 }
 SATURATED = "saturated margin"
