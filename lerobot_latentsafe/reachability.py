@@ -186,7 +186,9 @@ class SafetyCritic(nn.Module):
         _, spread, axes = torch.linalg.svd(features - self.feature_mean, full_matrices=False)
         kept = self.projection.shape[1]
         scale = spread[:kept].square().mean().sqrt() / len(features) ** 0.5
-        self.projection.copy_(axes[:kept].T / scale.clamp(min=1e-6))
+        # An axis has no sign of its own: rounding errors, which differ among machines and ranks, would choose it.
+        largest = axes[:kept].gather(1, axes[:kept].abs().argmax(1, keepdim=True))
+        self.projection.copy_((axes[:kept] * largest.sign()).T / scale.clamp(min=1e-6))
 
     def project(self, features: Tensor) -> Tensor:
         """Features (..., D) -> what q and actor read (..., C)."""
