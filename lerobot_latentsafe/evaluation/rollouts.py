@@ -24,6 +24,14 @@ def wilson(k: int, n: int, confidence: float = 0.95) -> dict[str, float]:
     return {"k": int(k), "n": int(n), "low": float(interval.low), "high": float(interval.high)}
 
 
+def mcnemar(before: np.ndarray, after: np.ndarray) -> float:
+    """Exact McNemar test of paired outcomes, bool (N,) each: the p-value of both being as frequent."""
+    from scipy.stats import binomtest
+
+    lost, gained = int((before & ~after).sum()), int((~before & after).sum())
+    return float(binomtest(gained, lost + gained).pvalue) if lost + gained else 1.0
+
+
 def confusion(predicted_safe: np.ndarray, truly_safe: np.ndarray) -> dict[str, float]:
     """Agreement of a monitor's verdicts with the truth, bool (N,) each.
 

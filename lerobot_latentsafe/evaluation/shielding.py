@@ -7,7 +7,7 @@ import torch
 from lerobot.envs import make_env, preprocess_observation
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_latentsafe.evaluation.rollouts import wilson
+from lerobot_latentsafe.evaluation.rollouts import mcnemar, wilson
 from lerobot_latentsafe.filter import FilterDecision, Reason
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.shield import BasePolicy
@@ -109,7 +109,8 @@ def _run_batch(actor: BasePolicy | LatentSafePolicy, env: EnvConfig, seeds: list
     steps, overridden, change = np.zeros(n, int), np.zeros(n, int), np.zeros(n)
     traces: list[dict[str, list]] = [{} for _ in range(n)]
     _record(traces, ~done, state=np.asarray(info["state"]) if "state" in info else None)
-    frames = [[frame] for frame in vector_env.call("render")[:n_videos]]
+    render = lambda: vector_env.call("render")[:n_videos] if n_videos else ()  # noqa: E731
+    frames = [[frame] for frame in render()]
     latents: list[list[Latent]] = [[] for _ in frames]
     while not done.all():
         batch = {**preprocess_observation(observation), "task": list(task)}
@@ -136,9 +137,7 @@ def _run_batch(actor: BasePolicy | LatentSafePolicy, env: EnvConfig, seeds: list
             if "state" in source:
                 traces[i].setdefault("state", []).append(np.asarray(source["state"][i]).tolist())
         _record(traces, alive, action=torch.from_numpy(action))
-        for kept, frame, running in zip(
-            frames, vector_env.call("render")[:n_videos], alive[:n_videos] & ~over[:n_videos]
-        ):
+        for kept, frame, running in zip(frames, render(), alive[:n_videos] & ~over[:n_videos]):
             if running:
                 kept.append(frame)
         done |= over
@@ -169,20 +168,16 @@ def compare(policy: LatentSafePolicy, env: EnvConfig, n_episodes: int, seed: int
     Returns:
         bare, shielded: rates; violation_p_value: exact McNemar test on the pairs; episodes: both `Episodes`.
     """
-    from scipy.stats import binomtest
-
     check_environment(policy, env)
     if policy.base is None:
         raise ValueError("nothing to shield: give --base_policy_path, or a checkpoint written by latentsafe wrap")
     bare = run_episodes(policy.base, env, n_episodes, seed, n_videos=n_videos)
     shielded = run_episodes(policy, env, n_episodes, seed, n_videos=n_videos)
-    saved, caused = (bare.violation & ~shielded.violation).sum(), (~bare.violation & shielded.violation).sum()
-    p_value = binomtest(int(caused), int(saved + caused)).pvalue if saved + caused else 1.0
     reasons = np.bincount([r for t in shielded.traces for r in t["reason"]], minlength=len(Reason))
     return {
         "bare": bare.rates(),
         "shielded": shielded.rates(),
-        "violation_p_value": float(p_value),
+        "violation_p_value": mcnemar(bare.violation, shielded.violation),
         "reasons": {reason.name.lower(): int(reasons[reason]) for reason in Reason if reasons[reason]},
         "episodes": {"bare": bare, "shielded": shielded},
     }
