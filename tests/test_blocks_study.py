@@ -64,14 +64,12 @@ def test_doomed_actions_are_replaced_by_the_best_retreat(scene, monkeypatch):
     assert retreated and executed[2] > 0
 
 
-def test_a_retreat_that_fells_a_block_is_known_to(scene):
+def test_a_block_that_is_bound_to_fall_is_foreseen(scene):
     scene.reset(0)
     at = scene.block_qpos[1]
     scene.data.qpos[at : at + 3] = [0.48, 0.25, 0.11]
     scene.data.qpos[at + 3 : at + 7] = [np.cos(0.2), np.sin(0.2), 0, 0]  # tilted by 0.4: it falls
-    filter = SimulatorLookahead(scene, horizon=30)
-    assert filter._outcome(scene.get_state(), STILL) < 0
-    assert filter(STILL)[1]
+    assert SimulatorLookahead(scene, horizon=40)._outcome(scene.get_state(), STILL) < 0
 
 
 def test_it_keeps_a_careless_operator_from_failing(scene):

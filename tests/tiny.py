@@ -228,14 +228,14 @@ BLOCKS_FRAMES = 12
 
 @contextmanager
 def short_blocks():
-    """Meanwhile episodes of the blocks have 12 frames, and a red block that moves at all counts as fallen."""
+    """Meanwhile episodes of the blocks have 12 frames, and the red blocks seem to fall after a quarter of a second."""
     from lerobot_latentsafe.envs import blocks
     from lerobot_latentsafe.envs.scenes import SCENES
 
     info = dataclasses.replace(SCENES["blocks"], episode_seconds=BLOCKS_FRAMES / SCENES["blocks"].fps)
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(SCENES, "blocks", info)
-        patch.setattr(blocks, "MAX_TILT", 1e-6)
+        patch.setattr(blocks.BlocksScene, "tilts", lambda self: np.full(2, 4 * self.data.time))
         yield
 
 
