@@ -124,6 +124,7 @@ class DreamerTraining:
             (self.folder / "policy.unfinished").rename(self.folder / "policy")
         if not (self.folder / "episodes").exists():
             export(self.replay, self.n_episodes, self.folder / "episodes", options.repo_id, self.scene)
+        self._note({"simulator_steps": self.n_episodes * self.replay.length})
         for env in self.envs:
             env.close()
         return self.policy
