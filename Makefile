@@ -1,5 +1,5 @@
 # Two commands do everything on a fresh machine, set-up included: `make demo` and `make test`.
-.PHONY: setup demo test lint results
+.PHONY: setup demo demo-bag test lint results
 
 PYTHON = .venv/bin/python
 
@@ -8,6 +8,9 @@ setup:
 
 demo: setup
 	$(PYTHON) scripts/demo.py
+
+demo-bag: setup
+	MUJOCO_GL=$${MUJOCO_GL:-egl} $(PYTHON) scripts/demo_bag.py
 
 test: lint
 	HF_HUB_OFFLINE=1 $(PYTHON) -m pytest

@@ -286,6 +286,8 @@ class Push:
     dataset_repo_id: str = "unknown"
     """The dataset named in the card."""
     base_policy_path: str | None = None
+    results: list[Path] = field(default_factory=list)
+    """Files of eval-shield or of the experiments in scripts/, whose rates the card is to report."""
     private: bool = False
 
     def run(self) -> None:
@@ -294,6 +296,7 @@ class Push:
         from lerobot_latentsafe.baselines.dreamer.modeling_dreamer import LatentSafeDreamerPolicy
         from lerobot_latentsafe.checkpoint import resolve_checkpoint
         from lerobot_latentsafe.hub import push_filter
+        from lerobot_latentsafe.model_card import measured
         from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 
         kind = PreTrainedConfig.from_pretrained(resolve_checkpoint(self.policy.path)).type
@@ -301,6 +304,8 @@ class Push:
         policy = policy_class.from_pretrained(self.policy.path)
         if self.base_policy_path:
             policy.attach(self.base_policy_path)
+        for file in self.results:
+            policy.config.evaluation |= measured(file, policy.config.law)
         print(f"pushed to {push_filter(policy, self.repo_id, self.dataset_repo_id, self.private)}")
 
 

@@ -42,6 +42,7 @@ class LatentSafeConfig(PreTrainedConfig):
         guard: steps for which the proposed action is imagined held before V is asked. 1 is the paper's law; more give
             room for what the world model gets wrong, as time, which a saturated margin cannot.
         calibration: the evidence epsilon was chosen on; written by `latentsafe calibrate`.
+        evaluation: what was measured -> the rate in words; written by `latentsafe push --results=...` for the card.
         lookahead: steps of imagination before the critic's value is read, 0 to 25: V and the fallback are the best of
             the critic's policy and of holding each action. 0 is the critic alone, and the cheapest.
         samples: next latents drawn from a stochastic world model, of which the worst counts; 0 imagines its mean or
@@ -53,6 +54,7 @@ class LatentSafeConfig(PreTrainedConfig):
         base_policy_path: the policy to shield: a folder, a Hub id or the name of a committed checkpoint.
         cameras: the image features the filter reads, by default all of the dataset's.
         task: what the world model was trained to imagine, in words, where a policy of the same task must share it.
+        robot_type: LeRobot's name of the robot that recorded the dataset.
         fps, state_names, action_names, action_low, action_high, state_mean, state_std: what the filter was trained
             on, in robot units; filled in from the dataset.
         kept_commands: actions that the fallback never changes, such as `gripper.pos`: it moves, but keeps its grip.
@@ -85,6 +87,7 @@ class LatentSafeConfig(PreTrainedConfig):
     guard: int = 1
     samples: int = 0
     calibration: dict[str, float] = field(default_factory=dict)
+    evaluation: dict[str, str] = field(default_factory=dict)
     lookahead: int = 15
     law: str = "reachability"
     mode: str = "filter"
@@ -93,6 +96,7 @@ class LatentSafeConfig(PreTrainedConfig):
 
     task: str | None = None
     cameras: list[str] | None = None
+    robot_type: str | None = None
     fps: int | None = None
     state_names: list[str] | None = None
     action_names: list[str] | None = None

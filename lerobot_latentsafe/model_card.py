@@ -1,12 +1,17 @@
-"""The filter's card on the Hub: what it saw, what it guards, how epsilon was set, and what it is not."""
+"""The filter's card on the Hub: what it saw, what it guards, how epsilon was set, what was measured, what it is not."""
 
+import json
+from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from huggingface_hub import ModelCard, ModelCardData
 
+from lerobot_latentsafe.configuration_latentsafe import LAWS, LatentSafeConfig
+from lerobot_latentsafe.evaluation.report import share
+
 if TYPE_CHECKING:
     from lerobot_latentsafe.baselines.dreamer.configuration_dreamer import LatentSafeDreamerConfig
-    from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
 
 TEXT = """---
 {header}
@@ -24,13 +29,15 @@ outside of what its data covered.
 | | |
 |---|---|
 | trained on | `{dataset}` |
+| robot | {robot} |
 | cameras | {cameras} |
 | rate | {fps} fps |
 | actions (robot units) | {actions} |
 | proprioception | {states} |
-| world model | {world_model}, {image_size} px |
+| world model | {world_model} |
 | failure specification | `{failure}` |
 | stage | {stage} |
+| law | {law} |
 | epsilon | {epsilon:g} |
 | epsilon was set | {calibration} |
 | shields | {base} |
@@ -38,9 +45,18 @@ outside of what its data covered.
 ```bash
 pip install lerobot_policy_latentsafe
 lerobot-eval --policy.path={repo_id} --policy.base_policy_path=<your policy> --env.type=...
+lerobot-teleoperate --robot.type=latentsafe_shielded --robot.filter={repo_id} --robot.inner.type=<your robot> ...
 ```
 
-First run it with `--policy.mode=monitor`, which never acts and reports what it would have done.
+First run it with `--policy.mode=monitor` or `--robot.mode=monitor`, which never acts and reports what it would have
+done.
+
+{confusion}{evaluation}## Limits
+
+- V means nothing outside of what the data covered: other cameras, objects, dynamics, lighting. Nothing detects that.
+- It acts at the last moment and with the fallback's full action; it looks for no safe action near the proposed one.
+- Imagination is deterministic: what is random in the world is foreseen as its mean.
+- A policy under it cannot tell that a frame is late or frozen; a robot under it (`latentsafe_shielded`) can.
 """
 
 TASK_POLICY_TEXT = """---
@@ -80,36 +96,116 @@ def _header(dataset_repo_id: str, license: str | None, tags: list[str] | None, n
     ).to_yaml()
 
 
+CONFUSION = """## As a monitor, on held-out episodes
+
+| | warned | quiet |
+|---|---|---|
+| failing episodes, {lead_steps:.0f} frames ahead | {warned} of {failing} | {missed} of {failing} |
+| frames of episodes that never fail | {alarms} of {safe} | {quiet} of {safe} |
+
+"""
+
+RATES = ("spilled", "spills_below_5_percent", "violation", "incompletion", "success")
+
+
 def make_model_card(
-    config: "LatentSafeConfig", dataset_repo_id: str, license: str | None, tags: list[str] | None
+    config: LatentSafeConfig, dataset_repo_id: str, license: str | None, tags: list[str] | None
 ) -> ModelCard:
     """The card of a filter, from its configuration alone."""
     actions = ", ".join(
         f"{name} in [{low:g}, {high:g}]"
         for name, low, high in zip(config.action_names or [], config.action_low or [], config.action_high or [])
     )
-    evidence = config.calibration
-    calibration = (
-        f"on {evidence['failing_episodes']:.0f} held-out failing episodes: {evidence['missed']:.1%} warned later than "
-        f"{evidence['lead_steps']:.0f} frames ahead, {evidence['false_alarms']:.1%} false alarms"
-        if evidence
-        else "by hand"
-    )
     return ModelCard(
         TEXT.format(
             header=_header(dataset_repo_id, license, tags, "latentsafe", "safety-filter"),
             dataset=dataset_repo_id,
+            robot=f"`{config.robot_type}`" if config.robot_type else "unknown",
             cameras=", ".join(f"`{c}` {tuple(config.input_features[c].shape)}" for c in config.cameras or []),
             fps=config.fps,
             actions=actions,
             states=", ".join(config.state_names or []),
-            world_model=config.world_model.type,
-            image_size=config.world_model.image_size,
+            world_model=_world_model(config),
             failure=config.failure_specification,
             stage=config.stage,
+            law=f"{config.law}, V read after {config.guard} + {config.lookahead} imagined steps",
             epsilon=config.epsilon,
-            calibration=calibration,
+            calibration=_calibration(config.calibration),
             base=f"`{config.base_policy_path}`" if config.base_policy_path else "nothing yet",
             repo_id=config.repo_id or "me/filter",
+            confusion=_confusion(config.calibration),
+            evaluation=_evaluation(config.evaluation),
         )
     )
+
+
+def _world_model(config: LatentSafeConfig) -> str:
+    text = f"{config.world_model.type}, {config.world_model.image_size} px"
+    if perception := getattr(config.world_model, "perception", None):
+        text += f", on {perception.components} components of the frozen encoder `{perception.encoder}`"
+        text += f" (weights {perception.encoder_hash}), which is not part of the checkpoint"
+    return text
+
+
+def _calibration(evidence: dict[str, float]) -> str:
+    if not evidence:
+        return "by hand"
+    return (
+        f"on {evidence['failing_episodes']:.0f} held-out failing episodes: {evidence['missed']:.1%} warned later than "
+        f"{evidence['lead_steps']:.0f} frames ahead, {evidence['false_alarms']:.1%} false alarms"
+    )
+
+
+def _confusion(evidence: dict[str, float]) -> str:
+    if not evidence:
+        return ""
+    failing, safe = round(evidence["failing_episodes"]), round(evidence["safe_frames"])
+    missed, alarms = round(evidence["missed"] * failing), round(evidence["false_alarms"] * safe)
+    counts = {"warned": failing - missed, "missed": missed, "alarms": alarms, "quiet": safe - alarms}
+    return CONFUSION.format(lead_steps=evidence["lead_steps"], failing=failing, safe=safe, **counts)
+
+
+def _evaluation(rates: dict[str, str]) -> str:
+    if not rates:
+        return ""
+    rows = "".join(f"| {what} | {rate} |\n" for what, rate in rates.items())
+    return f"## Measured\n\nRates with 95% Wilson intervals.\n\n| | |\n|---|---|\n{rows}\n"
+
+
+def measured(file: str | Path, law: str) -> dict[str, str]:
+    """The rates of a results file, as what was measured -> the rate in words.
+
+    Only those under a law, or under none, and of several filters only those of all together.
+
+    Raises:
+        ValueError: not a results file, or one without rates.
+    """
+    try:
+        content = json.loads(Path(file).read_text())
+    except (OSError, json.JSONDecodeError) as e:
+        raise ValueError(f"--results={file} is not a readable results file ({e})") from e
+    rates = {", ".join(path): rate for path, rate in _rates(content, law)}
+    if not rates:
+        raise ValueError(
+            f"--results={file} holds none of {', '.join(RATES)}; give a file of latentsafe eval-shield, "
+            "scripts/bag_policies.py, scripts/bag_operators.py or scripts/bag_out_of_distribution.py"
+        )
+    source = {name: content.get(name, "unknown") for name in ("command", "commit", "date")}
+    made = f"`{source['command']}` at commit {source['commit']}, {source['date']}"
+    stem = Path(file).stem
+    return {**{f"{stem}: {what}": rate for what, rate in rates.items()}, f"{stem}: made by": made}
+
+
+def _rates(content: dict, law: str, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], str]]:
+    for name, entry in content.items():
+        if "pooled" in content and name not in ("bare", "pooled"):
+            continue
+        if not isinstance(entry, dict) or name.split()[-1] in {*LAWS} - {law}:
+            continue
+        if {"k", "n"} <= entry.keys():
+            if name in RATES:
+                yield (*path, name.replace("_", " ")), share(entry)
+        else:
+            yield from _rates(entry, law, (*path, name))
+            if "overridden_share" in entry and name != "bare":
+                yield (*path, name, "steps overridden"), f"{entry['overridden_share']:.1%}"

@@ -29,6 +29,8 @@ logger = logging.getLogger(__name__)
 BASE_FOLDER = "base_policy"
 CONSTANT_BAND = 0.05
 """Relative half-width of the range of a command that never varies in the data."""
+RANGE_SLACK = 0.25
+"""Share of the range trained on by which another dataset's actions may exceed it."""
 
 
 class UntrainedFilterError(RuntimeError):
@@ -122,6 +124,19 @@ class LatentSafePolicy(PreTrainedPolicy):
         middle = (self.action_low + self.action_high) / 2
         still = torch.zeros_like(middle).clamp(self.action_low, self.action_high)
         return torch.where(self.action_varies, still, middle).repeat(batch_size, 1)
+
+    def commands_seen(self, state: Tensor) -> Tensor:
+        """What a normalised state (B, S) tells of commands of the same name, such as `gripper.pos`.
+
+        Returns:
+            (B, A) in robot units, in range; NaN for commands that the state does not tell.
+        """
+        names, seen = self.config.state_names or [], state.new_full((len(state), len(self.action_low)), torch.nan)
+        for i, name in enumerate(self.config.action_names or []):
+            if name in names:
+                j = names.index(name)
+                seen[:, i] = state[:, j] * self.state_std[j] + self.state_mean[j]
+        return seen.clamp(self.action_low, self.action_high)
 
     # -- training (stage 1) ---
 
@@ -328,6 +343,7 @@ def adopt_dataset(config: LatentSafeConfig, meta, stats: dict) -> None:
                 "train a new filter or use a dataset recorded with the same robot and rate"
             )
         setattr(config, name, value)
+    config.robot_type = config.robot_type or meta.robot_type
     if config.action_low is None:
         low, high = _list(stats["action"]["min"]), _list(stats["action"]["max"])
         config.action_varies = [h - l > 1e-6 for l, h in zip(low, high)]
@@ -339,6 +355,7 @@ def adopt_dataset(config: LatentSafeConfig, meta, stats: dict) -> None:
         config.action_high = [h + b for h, b in zip(high, band)]
         config.state_mean = _list(stats["observation.state"]["mean"])
         config.state_std = [max(s, 1e-3) for s in _list(stats["observation.state"]["std"])]
+    _check_range(config, meta.repo_id, _list(stats["action"]["min"]), _list(stats["action"]["max"]))
     # The data's actions decide the candidates' range check.
     for candidate in config.action_candidates or []:
         inside = all(lo - 1e-4 <= a <= hi + 1e-4 for lo, a, hi in zip(config.action_low, candidate, config.action_high))
@@ -346,6 +363,19 @@ def adopt_dataset(config: LatentSafeConfig, meta, stats: dict) -> None:
             raise ValueError(
                 f"action candidate {candidate} is outside of what {meta.repo_id} covers: "
                 f"{config.action_low} to {config.action_high}"
+            )
+
+
+def _check_range(config: LatentSafeConfig, repo_id: str, low: list[float], high: list[float]) -> None:
+    """Refuse actions far outside of the range that the filter was trained on: they would be clipped, unseen."""
+    for name, l, h, trained_low, trained_high in zip(
+        config.action_names, low, high, config.action_low, config.action_high
+    ):
+        slack = RANGE_SLACK * (trained_high - trained_low)
+        if l < trained_low - slack or h > trained_high + slack:
+            raise ValueError(
+                f"{name} of {repo_id} reaches from {l:g} to {h:g}, this filter was trained on {trained_low:g} to "
+                f"{trained_high:g}: another unit, or another robot? Convert the actions, or train a new filter"
             )
 
 

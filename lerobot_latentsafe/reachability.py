@@ -117,6 +117,8 @@ class ReachabilityConfig:
         steps: gradient steps.
         batch_size: imagined states a gradient step; with discrete actions each is backed up under all of them.
         lr, actor_lr: AdamW step sizes, decayed over the second half.
+        actor_through: what a continuous actor climbs: `critic`, Q(z, a) of the states in the pool; or `world_model`,
+            the value of the latent that the world model predicts, through its gradient.
         gamma: the final discount; 1 - gamma is annealed from `gamma_start` geometrically over `anneal` of the run,
             after `warmup` of the run at gamma = 0.
         caution: weight of overestimates of V in the squared error, relative to underestimates.
@@ -137,6 +139,7 @@ class ReachabilityConfig:
     batch_size: int = 512
     lr: float = 1e-3
     actor_lr: float = 3e-4
+    actor_through: str = "critic"
     gamma: float = 0.9999
     gamma_start: float = 0.8
     warmup: float = 0.04
@@ -147,6 +150,10 @@ class ReachabilityConfig:
     refresh: int = 250
     greedy: float = 0.5
     switch: float = 0.1
+
+    def __post_init__(self) -> None:
+        if self.actor_through not in ("critic", "world_model"):
+            raise ValueError(f"actor_through is {self.actor_through!r}; expected critic or world_model")
 
 
 def _mlp(sizes: list[int], activation: str) -> nn.Sequential:
@@ -456,7 +463,8 @@ class LatentReachability:
         critic_loss = self._cautious_loss(self._predict(batch) - target)
         loss = critic_loss
         if self.critic.actor is not None:
-            loss = loss - self._actor_objective(batch["x"])
+            through_model = config.actor_through == "world_model"
+            loss = loss - (self._imagined_value() if through_model else self._actor_objective(batch["x"]))
         self.optimizer.zero_grad(set_to_none=True)
         (weight * loss).backward()
         metrics = weight * torch.stack([critic_loss.detach(), target.mean()])
@@ -506,3 +514,10 @@ class LatentReachability:
         frozen = {name: p.detach() for name, p in self.critic.q.named_parameters()}
         inputs = torch.cat([x, self.critic.act(x) * (self.critic.high > self.critic.low)], -1)
         return torch.func.functional_call(self.critic.q, frozen, (inputs,)).mean()
+
+    def _imagined_value(self) -> Tensor:
+        """Mean V of the latents that the actor's actions lead to from fresh starts; its gradient runs through them."""
+        latent = self.starts(self.config.batch_size)
+        action = self.imagination.complete(latent, self.critic.fallback(self.imagination.features(latent)))
+        after = self.imagination.step(latent, action)
+        return self.target.value(self.imagination.features(after), self.imagination.margin(after)).mean()

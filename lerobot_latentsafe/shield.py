@@ -16,6 +16,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from lerobot_latentsafe.checkpoint import TRAINED
+from lerobot_latentsafe.datasets.frame_cache import check_proportions
 from lerobot_latentsafe.filter import FilterDecision, Reason, least_restrictive
 from lerobot_latentsafe.world_models.base import Latent, map_latent, replace_rows
 
@@ -73,7 +74,7 @@ class Shield:
         started = self.clock()
         model, config = self.filter, self.filter.config
         images, state, fault = self._check_observation(observation, age_s)
-        fault, proposed, inputs = self._check_action(proposed, fault, len(state), without)
+        fault, proposed, inputs = self._check_action(proposed, fault, state, without)
         fault = _first_fault(fault, torch.ones_like(fault, dtype=torch.bool), known)
         latent = self._filter_history(images, state, inputs, fault)
         margin = model.imagination.margin(latent)
@@ -81,7 +82,7 @@ class Shield:
         both = {key: torch.cat([predicted[key], latent[key]]) for key in latent}  # one pass through imagination
         sizes = [len(on_the_way), len(state)]
         (value, here), (_, action) = (part.split(sizes) for part in model.plan(both))
-        fallback = self._usable(action, here)
+        fallback = self._usable(action, here, state)
         # A margin that is negative now, or on the way, is a failure whatever comes after.
         value = model.worst(on_the_way, value).view(-1, len(state)).amin(0)
         value = model.worst(margin, value)
@@ -141,11 +142,17 @@ class Shield:
                 "(--rename_map), or train a filter for this robot"
             )
         state = model.normalise_state(observation["observation.state"].to(model.device))
+        if self.executed is not None and len(self.executed) != len(state):
+            raise ValueError(
+                f"the batch went from {len(self.executed)} to {len(state)} robots within an episode; "
+                "call reset() between episodes"
+            )
         fault = torch.zeros(len(state), dtype=torch.long, device=model.device)
         images = {}
         finite = torch.isfinite(state).all(-1)
         for key in model.world_model.image_keys:
             image = observation[key].to(model.device)
+            check_proportions(key, tuple(image.shape[1:]), config.input_features[key].shape)
             finite &= torch.isfinite(image).flatten(1).all(1)
             in_range = (image >= -1e-3).flatten(1).all(1) & (image <= 1 + 1e-3).flatten(1).all(1)
             finite &= in_range
@@ -159,14 +166,14 @@ class Shield:
         return images, state.nan_to_num(0.0), fault
 
     def _check_action(
-        self, proposed: Tensor | None, fault: Tensor, batch_size: int, without: Reason
+        self, proposed: Tensor | None, fault: Tensor, state: Tensor, without: Reason
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Faults, the proposal in robot units, and model inputs in [-1, 1]."""
-        model = self.filter
+        model, batch_size = self.filter, len(state)
         everyone = torch.ones(batch_size, dtype=torch.bool, device=model.device)
         if proposed is None:
             fault = _first_fault(fault, everyone, without)
-            proposed = self._hold(batch_size)
+            proposed = self._hold(state)
         proposed = proposed.to(model.device, torch.float32)
         expected = (batch_size, len(model.config.action_low))
         if tuple(proposed.shape) != expected:
@@ -175,7 +182,7 @@ class Shield:
                 f"{', '.join(model.config.action_names or [])}. The base policy must be of the filter's action space"
             )
         finite = torch.isfinite(proposed).all(-1)
-        inputs = model.normalise_action(proposed).nan_to_num(0.0)
+        inputs = model.normalise_action(torch.where(finite[:, None], proposed, self._hold(state)))
         fault = _first_fault(fault, ~finite, Reason.ACTION_NOT_FINITE)
         out_of_range = (inputs.abs() > 1 + 2 * RANGE_TOLERANCE).any(-1)
         fault = _first_fault(fault, out_of_range, Reason.ACTION_OUT_OF_RANGE)
@@ -184,11 +191,6 @@ class Shield:
     def _filter_history(self, images: dict[str, Tensor], state: Tensor, inputs: Tensor, fault: Tensor) -> Latent:
         """Posterior of the world model; rows whose observation is unusable go on by imagination alone."""
         world_model = self.filter.world_model
-        if self.executed is not None and len(self.executed) != len(state):
-            raise ValueError(
-                f"the batch went from {len(self.executed)} to {len(state)} robots within an episode; "
-                "call reset() between episodes"
-            )
         start = self.latent is None
         latent = world_model.initial(len(state)) if start else self.latent
         predicted = world_model.step(latent, self.filter.first_action(inputs) if start else self.executed)
@@ -211,17 +213,16 @@ class Shield:
             least = torch.minimum(least, imagination.margin(latent))
         return latent, least
 
-    def _usable(self, action: Tensor, value: Tensor) -> Tensor:
+    def _usable(self, action: Tensor, value: Tensor, state: Tensor) -> Tensor:
         """The safety policy's action in robot units; where it or its value is not finite, hold."""
         finite = torch.isfinite(action).all(-1) & torch.isfinite(value)
-        return torch.where(finite[:, None], self.filter.denormalise_action(action), self._hold(len(action)))
+        return torch.where(finite[:, None], self.filter.denormalise_action(action), self._hold(state))
 
-    def _hold(self, batch_size: int) -> Tensor:
-        """No motion, and the kept commands as they were, in robot units."""
-        model, still = self.filter, self.filter.hold_action(batch_size)
-        if self.executed is None:
-            return still
-        return torch.where(model.kept, model.denormalise_action(self.executed), still)
+    def _hold(self, state: Tensor) -> Tensor:
+        """No motion, and the kept commands as they were, or are seen to be if nothing was executed yet: robot units."""
+        model, still = self.filter, self.filter.hold_action(len(state))
+        kept = model.commands_seen(state) if self.executed is None else model.denormalise_action(self.executed)
+        return torch.where(model.kept & kept.isfinite(), kept, still)
 
 
 _shields: "weakref.WeakSet[Shield]" = weakref.WeakSet()

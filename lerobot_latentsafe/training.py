@@ -52,6 +52,9 @@ def fit_margin(
 ) -> None:  # fmt: skip
     """Fit a margin (Eq. 3) to fixed features, regularised: trained along with a world model it overfits.
 
+    The hinge loss says little about how far beyond delta a margin goes. It is scaled to a median size of 1, where tanh,
+    which bounds it for the backup, still tells a sure margin from a surer one.
+
     Args:
         noise: standard deviation of Gaussian noise on the features, which are scaled to unit deviation meanwhile.
     """
@@ -71,6 +74,9 @@ def fit_margin(
     with torch.no_grad():  # the margin reads features as they are
         first.weight.div_(std)
         first.bias.sub_(first.weight @ mean)
+        size = margin(features).abs().median().clamp(min=1e-3)
+        margin.net[-1].weight.div_(size)
+        margin.net[-1].bias.div_(size)
 
 
 def train_margin(path: str | Path, dataset_meta, output_dir: Path, seed: int = 0) -> LatentSafePolicy:
@@ -194,6 +200,8 @@ def train_reachability(
     generator = torch.Generator(device="cpu").manual_seed(seed)
     if not policy.critic.discrete:
         policy.config.fallback_low, policy.config.fallback_high = covered_actions(policy, reader, config.coverage)
+    policy.world_model.requires_grad_(False)
+    policy.margin.requires_grad_(False)
     policy.critic = policy.new_critic(policy.critic.candidates)
     started = time.process_time()
     starts = encoded_starts(policy, reader, generator)

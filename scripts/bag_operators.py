@@ -4,20 +4,20 @@
     scripts/bag_operators.py --policy=<filter> --operators closed_end open_end --n=100
 
 Writes results/bag/operators.json: for each operator and law the episodes that spill, the share of candies lost, steps
-overridden, the step of the first override, and the CPU time of a decision.
+overridden, the step of the first override, the CPU time of a decision, and the values of a few episodes step by step;
+operators.png beside it draws those of the first law that filters.
 """
 
 import argparse
-import time
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from lerobot_latentsafe.envs.bag import BagScene
-from lerobot_latentsafe.envs.franka import CAMERAS
-from lerobot_latentsafe.evaluation.rollouts import provenance, wilson, write_json
-from lerobot_latentsafe.filter import FilterDecision
+from lerobot_latentsafe.evaluation.bag import FIRST_SEED, drive, in_short, summary, traces
+from lerobot_latentsafe.evaluation.figures import save, value_profiles
+from lerobot_latentsafe.evaluation.rollouts import provenance, write_json
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.teleoperators.scripted.behaviors import begin
 
@@ -30,69 +30,19 @@ OPERATORS = {
     "side_to_side_0.30": ("side_to_side", 0.30),
 }
 LAWS = ("bare", "reachability", "plan", "margin")
-STEPS = 90
-FIRST_SEED = 300_000
-"""Settings were chosen on smaller seeds."""
 
 
-def observe(scene: BagScene) -> dict[str, torch.Tensor]:
-    """What the robot would send, as a LeRobot batch of one."""
-    images = {
-        f"observation.images.{name}": torch.from_numpy(scene.render(name)).permute(2, 0, 1)[None] / 255.0
-        for name in CAMERAS
-    }
-    return {**images, "observation.state": torch.from_numpy(scene.proprioception())[None]}
-
-
-def drive(scene: BagScene, operator: str, seed: int, policy: LatentSafePolicy | None) -> dict:
-    """One episode; an operator who is overridden goes on trying."""
+def episode(scene: BagScene, operator: str, seed: int, policy: LatentSafePolicy | None) -> dict:
+    """One episode of an operator, see `drive`."""
     behavior, speed = OPERATORS[operator]
     scene.reset(seed)
-    actions = begin(behavior, scene, speed, np.random.default_rng([0, seed]))
-    action, decisions, cost = np.zeros(7), [], []
-    if policy is not None:
-        policy.reset()
-    for _ in range(STEPS):
-        action = next(actions, np.append(np.zeros(6), action[6]))
-        executed = action
-        if policy is not None:
-            seen, began = observe(scene), time.process_time()
-            decision = policy.shield(seen, torch.from_numpy(action).float()[None])
-            cost.append(time.process_time() - began)
-            decisions.append(decision)
-            executed = decision.action[0].double().numpy()
-        scene.step(executed)
-    truth = scene.truth()
-    return {"lost": truth["spilled"], "success": bool(truth["is_success"]), "cost": cost, **_overrides(decisions)}
-
-
-def _overrides(decisions: list[FilterDecision]) -> dict:
-    intervened = [bool(d.intervened.item()) for d in decisions]
-    first = intervened.index(True) if any(intervened) else None
-    return {"overridden": sum(intervened), "first": first, "value": [d.value.item() for d in decisions]}
+    return drive(scene, policy, begin(behavior, scene, speed, np.random.default_rng([0, seed])))
 
 
 def cell(scene: BagScene, operator: str, n: int, policy: LatentSafePolicy | None) -> dict:
-    """All episodes of an operator under one law."""
-    rows = [drive(scene, operator, FIRST_SEED + i, policy) for i in range(n)]
-    lost = np.array([row["lost"] for row in rows])
-    result = {
-        "spilled": wilson(int((lost > 0).sum()), n),
-        "spilled_5_percent": wilson(int((lost >= 0.05 * scene.n_candies).sum()), n),
-        "success": wilson(sum(row["success"] for row in rows), n),
-        "mean_share_lost": float(lost.mean() / scene.n_candies),
-        "lost": lost.tolist(),
-    }
-    if policy is not None:
-        firsts = [row["first"] for row in rows if row["first"] is not None]
-        cost = np.concatenate([row["cost"][3:] for row in rows])
-        result |= {
-            "overridden_share": float(np.mean([row["overridden"] for row in rows]) / STEPS),
-            "episodes_overridden": len(firsts),
-            "median_first_override": float(np.median(firsts)) if firsts else None,
-            "decision_cpu_ms": {"p50": float(np.median(cost) * 1e3), "p99": float(np.quantile(cost, 0.99) * 1e3)},
-        }
-    return result
+    """All episodes of an operator under one law, and the traces of the first few."""
+    rows = [episode(scene, operator, FIRST_SEED + i, policy) for i in range(n)]
+    return {**summary(rows, scene.n_candies), "traces": traces(rows)}
 
 
 def main() -> None:
@@ -116,8 +66,10 @@ def main() -> None:
             if law != "bare":
                 policy.config.law = law
             table[f"{operator} {law}"] = row = cell(scene, operator, arguments.n, None if law == "bare" else policy)
-            shown = {k: row[k] for k in ("mean_share_lost", "overridden_share", "decision_cpu_ms") if k in row}
-            print(operator, law, f"spilled {row['spilled']['k']}/{arguments.n}", shown, flush=True)
+            print(operator, law, in_short(row), flush=True)
+    if filtering := [law for law in arguments.laws if law != "bare"]:
+        panels = {operator: table[f"{operator} {filtering[0]}"]["traces"] for operator in arguments.operators}
+        save(value_profiles(panels, policy.config.epsilon, scene.fps), arguments.output.with_suffix(".png"))
     row = {**table, "epsilon": policy.config.epsilon, "guard": policy.config.guard}
     write_json(arguments.output, {**row, **provenance(seeds=[FIRST_SEED, FIRST_SEED + arguments.n - 1])})
 

@@ -27,7 +27,7 @@ from lerobot_latentsafe.evaluation.blocks_study import (
     values_along,
 )
 from lerobot_latentsafe.evaluation.figures import save
-from lerobot_latentsafe.evaluation.rollouts import mcnemar, provenance, wilson, write_json
+from lerobot_latentsafe.evaluation.rollouts import paired_p_value, provenance, wilson, write_json
 from lerobot_latentsafe.evaluation.shielding import Episodes, check_environment, run_episodes
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.shield import BasePolicy
@@ -92,7 +92,7 @@ def rates(rows: list[dict]) -> dict:
 
 def against(rows: list[dict], bare: dict) -> list[dict]:
     """Exact McNemar tests of each seed's row against the bare policy, start by start."""
-    return [{name: mcnemar(bare[name], row[name]) for name in OUTCOMES} for row in rows]
+    return [{name: paired_p_value(bare[name], row[name]) for name in OUTCOMES} for row in rows]
 
 
 def lead_times(study: Study, path: str, n: int, seed: int) -> tuple[list[int], int, tuple]:

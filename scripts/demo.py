@@ -7,38 +7,17 @@ outputs/demo/report.html and outputs/demo/metrics.json. Numbers of full size are
 
 import argparse
 import json
-import os
 import shutil
-import subprocess
-import sys
 import threading
-import time
 from pathlib import Path
 
-BIN = Path(sys.executable).parent
+from lerobot_latentsafe.evaluation.demo import Demo
+
 CANDIDATES = "[[-1.25,1.0],[0.0,1.0],[1.25,1.0]]"
 
 
-class Demo:
-    """Runs commands one by one, with their output in a log each and one line a step on the screen."""
-
-    def __init__(self, out: Path):
-        self.out, self.started = out, time.time()
-        self.environment = {**os.environ, "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", "TQDM_DISABLE": "1"}
-        (out / "logs").mkdir(parents=True)
-
-    def run(self, what: str, *command: str) -> None:
-        log = self.out / "logs" / f"{what.split(':')[0].replace(' ', '_')}.log"
-        print(f"[{time.time() - self.started:4.0f} s] {what}", flush=True)
-        with log.open("a") as stream:
-            stream.write(f"$ {' '.join(command)}\n")
-            stream.flush()
-            done = subprocess.run(
-                [str(BIN / command[0]), *command[1:]], stdout=stream, stderr=subprocess.STDOUT, env=self.environment
-            )
-        if done.returncode:
-            tail = "\n".join(log.read_text().splitlines()[-15:])
-            raise SystemExit(f"demo: '{what}' failed; the end of {log}:\n{tail}")
+class DubinsDemo(Demo):
+    """The car's road from episodes to a shielded policy."""
 
     def data(self, source: str, n: int) -> str:
         root, repo = self.out / source, f"demo/{source}"
@@ -98,7 +77,7 @@ def main() -> None:
     out = arguments.out
     if out.exists():
         shutil.rmtree(out)
-    demo = Demo(out)
+    demo = DubinsDemo(out)
 
     # Two cores, two branches: the policy to be shielded is trained beside the filter.
     found: dict[str, str] = {}
@@ -125,7 +104,7 @@ def main() -> None:
         *(f"--n_episodes={arguments.n_episodes}", f"--json={out}/shield.json", f"--figure={out}/trajectories.png"),
         *(f"--video={out}/videos", "--n_videos=3"),
     )
-    report(out, time.time() - demo.started)
+    report(out, demo.seconds)
 
 
 def save_every_seventh_state(file: Path) -> None:

@@ -12,7 +12,6 @@ import tiny
 from lerobot_latentsafe.baselines.simulator import SimulatorLookahead
 from lerobot_latentsafe.envs.scenes import make_scene
 from lerobot_latentsafe.evaluation.blocks_study import lead
-from lerobot_latentsafe.evaluation.rollouts import mcnemar
 from lerobot_latentsafe.teleoperators.scripted.behaviors import begin
 
 SCRIPT = Path(__file__).parents[1] / "scripts" / "blocks_table2.py"
@@ -93,13 +92,6 @@ def _fails(scene, seed, filter):
 )
 def test_lead_counts_from_warning_to_failure(margin, value, expected):
     assert lead(np.array(margin), np.array(value), epsilon=0.3) == expected
-
-
-def test_mcnemar_is_that_of_the_discordant_pairs():
-    before = np.array([True] * 8 + [False] * 12)
-    after = np.array([False] * 7 + [True] + [False] * 11 + [True])
-    assert mcnemar(before, after) == pytest.approx(2 * (1 + 8) / 2**8)
-    assert mcnemar(before, before) == 1.0
 
 
 @pytest.fixture

@@ -120,6 +120,16 @@ def test_card_says_what_it_is_and_what_it_is_not(hub, policy):
     assert "turn_rate.vel in [-1.25, 1.25]" in card.text and "monitor" in card.text
 
 
+def test_card_counts_the_monitors_mistakes(policy):
+    policy.config.calibration = {
+        "epsilon": 0.1, "missed": 0.05, "false_alarms": 0.1, "lead_steps": 3.0, "failing_episodes": 40.0,
+        "safe_frames": 900.0,
+    }  # fmt: skip
+    text = policy.generate_model_card("me/car", "latentsafe", None, None).text
+    assert "| failing episodes, 3 frames ahead | 38 of 40 | 2 of 40 |" in text
+    assert "| frames of episodes that never fail | 90 of 900 | 810 of 900 |" in text
+
+
 def test_card_admits_an_epsilon_set_by_hand(policy):
     card = policy.generate_model_card("me/car", "latentsafe", None, None)
     assert "| epsilon was set | by hand |" in card.text
@@ -167,3 +177,87 @@ def test_push_command_reports_an_unreachable_hub(no_hub, tiny_filter):
 
     with pytest.raises(SystemExit, match="latentsafe push: cannot create me/filter"):
         main(["push", f"--policy.path={tiny_filter}", "--repo_id=me/filter"])
+
+
+# -- a filter that sees by a frozen encoder ---
+
+
+@pytest.fixture
+def seeing(token_root):
+    """The filter of a gru world model, whose encoder is not part of its checkpoint."""
+    policy = tiny.new_policy(tiny.metadata(token_root), world_model=tiny.gru_config(), action_candidates=None)
+    policy.config.stage, policy.config.frame_cache = "reachability", None
+    return policy.eval()
+
+
+def test_filter_on_tokens_comes_back_with_its_basis_and_the_same_encoder(hub, seeing):
+    push_filter(seeing, "me/bag", "me/car")
+    assert not [name for name in hub.repos["me/bag"] if "encoder" in name]
+    pulled = LatentSafePolicy.from_pretrained("me/bag")
+    ours, theirs = (p.config.world_model.perception for p in (seeing, pulled))
+    assert theirs.encoder_hash == ours.encoder_hash and theirs.basis_hash == ours.basis_hash
+    assert pulled.world_model.perception.basis.fitted
+    assert_same_decisions(seeing, pulled)
+
+
+def test_an_encoder_with_other_weights_is_refused(hub, seeing):
+    seeing.config.world_model.perception.encoder_hash = "0" * 16
+    push_filter(seeing, "me/bag", "me/car")
+    with pytest.raises(ValueError, match="0000000000000000"):
+        LatentSafePolicy.from_pretrained("me/bag")
+
+
+def test_card_names_the_encoder_and_what_was_measured(hub, seeing, tmp_path):
+    from lerobot_latentsafe.cli import main
+    from lerobot_latentsafe.evaluation.rollouts import wilson, write_json
+    from lerobot_latentsafe.training import save_filter
+
+    save_filter(seeing, tmp_path / "filter")
+    rates = {"spilled": wilson(3, 100), "success": wilson(90, 100), "overridden_share": 0.123, "lost": [1, 2]}
+    cells = {"bare": {"spilled": wilson(70, 100)}, "plan": {"pooled": {"spilled": wilson(44, 100)}}}
+    cells["reachability"] = {"outputs/filter": {"spilled": wilson(55, 100)}, "pooled": rates}
+    write_json(tmp_path / "policies.json", {"weak": cells, "command": "bag_policies.py", "commit": "abc", "date": "-"})
+    options = [f"--policy.path={tmp_path / 'filter'}", f"--results=[{tmp_path / 'policies.json'}]"]
+    main(["push", *options, "--repo_id=me/bag", "--dataset_repo_id=me/car"])
+    text = hub.repos["me/bag"]["README.md"].decode()
+    for row in (
+        "| policies: weak, bare, spilled | 70/100 = 70.0% [60.4, 78.1] |",
+        "| policies: weak, reachability, pooled, steps overridden | 12.3% |",
+        "| policies: made by | `bag_policies.py` at commit abc, - |",
+        f"`efficientnet_lite0` (weights {seeing.config.world_model.perception.encoder_hash})",
+    ):
+        assert row in text
+    assert "44/100" not in text and "55/100" not in text  # another law; one filter of several
+    assert LatentSafePolicy.from_pretrained("me/bag").config.evaluation["policies: weak, bare, spilled"]
+
+
+@pytest.mark.parametrize(
+    ("content", "words"), [("{", "not a readable"), ('{"commit": "abc"}', "holds none of spilled")]
+)
+def test_results_without_rates_are_refused(tmp_path, content, words):
+    from lerobot_latentsafe.model_card import measured
+
+    (tmp_path / "results.json").write_text(content)
+    with pytest.raises(ValueError, match=words):
+        measured(tmp_path / "results.json", "reachability")
+
+
+@pytest.mark.parametrize("shielded", [False, True])
+def test_lerobots_own_push_is_the_same(hub, seeing, shielded, tiny_diffusion):
+    """`--policy.push_to_hub=true` of lerobot-train."""
+    from lerobot.configs.default import DatasetConfig
+    from lerobot.configs.train import TrainPipelineConfig
+
+    from lerobot_latentsafe.processor_latentsafe import make_latentsafe_pre_post_processors
+
+    if shielded:
+        seeing.attach(tiny_diffusion)
+    seeing.config.repo_id = "me/trained"
+    config = TrainPipelineConfig(dataset=DatasetConfig(repo_id="me/car"), policy=seeing.config)
+    seeing.push_model_to_hub(config)
+    for pipeline in make_latentsafe_pre_post_processors(seeing.config):
+        pipeline.push_to_hub("me/trained")
+    pulled = LatentSafePolicy.from_pretrained("me/trained")
+    assert (pulled.base is not None) == shielded
+    assert "not a certified" in hub.repos["me/trained"]["README.md"].decode()
+    assert_same_decisions(seeing, pulled)

@@ -14,7 +14,7 @@ from safetensors.torch import load_file, save_file
 from lerobot_latentsafe import LatentSafeConfig, LatentSafeDubinsEnv
 from lerobot_latentsafe.checkpoint import CheckpointError, resolve_checkpoint, seal
 from lerobot_latentsafe.filter import Reason
-from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, UntrainedFilterError
+from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, UntrainedFilterError, adopt_dataset
 from lerobot_latentsafe.training import save_filter, train_reachability
 
 load = LatentSafePolicy.from_pretrained
@@ -229,6 +229,21 @@ def test_dataset_of_another_robot_is_refused(tiny_world_model, cache_root, tmp_p
             load(tiny_world_model, config=config, dataset_meta=other)
         else:
             train_reachability(tiny_world_model, other, tmp_path / "out")
+
+
+@pytest.mark.parametrize(("low", "high"), [(-71.6, 71.6), (-1.25, 2.0)], ids=["degrees", "faster"])
+def test_dataset_of_another_action_range_is_refused(tiny_world_model, cache_meta, low, high):
+    config = PreTrainedConfig.from_pretrained(tiny_world_model)
+    action = {**cache_meta.stats["action"], "min": [low, 1.0], "max": [high, 1.0]}
+    with pytest.raises(ValueError, match=r"turn_rate.vel of me/car.*trained on -1\.25 to 1\.25.*unit"):
+        adopt_dataset(config, cache_meta, {**cache_meta.stats, "action": action})
+
+
+def test_dataset_of_other_pictures_is_refused(tiny_world_model, dataset_meta):
+    config = PreTrainedConfig.from_pretrained(tiny_world_model)
+    config.frame_cache, config.input_features["observation.image"].shape = None, (3, 96, 128)
+    with pytest.raises(ValueError, match=r"observation\.image has shape \(3, \d+, \d+\).*trained on \(3, 96, 128\)"):
+        load(tiny_world_model, config=config, dataset_meta=dataset_meta)
 
 
 @pytest.mark.parametrize("candidates", [[[9.0, 1.0]], [[0.0, 1.0], [-1.3, 1.0]], [[0.0]], [[0.0, 1.0, 0.0]]])

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -54,13 +55,14 @@ CHAIN = ReachabilityConfig(
 )
 
 
-@pytest.fixture(scope="module", params=["discrete", "continuous"])
+@pytest.fixture(scope="module", params=["discrete", "continuous", "through the world model"])
 def learned(request):
     torch.manual_seed(0)
     candidates = torch.tensor([[-1.0], [0.0], [1.0]]) if request.param == "discrete" else None
-    critic = SafetyCritic(1, 1, candidates, CHAIN)
-    learner = LatentReachability(WindyChain(), critic, lambda n: {"x": 2 * torch.rand(n, 1) - 1}, CHAIN)
-    for _ in range(CHAIN.steps):
+    config = replace(CHAIN, actor_through="world_model") if request.param == "through the world model" else CHAIN
+    critic = SafetyCritic(1, 1, candidates, config)
+    learner = LatentReachability(WindyChain(), critic, lambda n: {"x": 2 * torch.rand(n, 1) - 1}, config)
+    for _ in range(config.steps):
         learner.update()
     return critic
 
@@ -112,6 +114,11 @@ def test_fallback_keeps_safe_what_can_be_kept_safe(learned):
         for _ in range(60):
             latent = world.step(latent, learned.fallback(world.features(latent)))
     assert (world.margin(latent) > 0).float().mean() > 0.95
+
+
+def test_an_actor_climbs_only_what_is_known():
+    with pytest.raises(ValueError, match="actor_through is 'reward'; expected critic or world_model"):
+        ReachabilityConfig(actor_through="reward")
 
 
 def test_value_never_exceeds_the_margin(learned):

@@ -168,6 +168,18 @@ def test_image_in_bytes_is_not_taken_for_one_in_0_to_1(permissive):
     assert permissive.shield(observation, actions(LEFT)).intervened.all()
 
 
+@pytest.mark.parametrize("shape", [(3, 3, 128, 96), (3, 1, 128, 128), (3, 128, 128, 3)])
+def test_image_of_other_proportions_is_refused(permissive, shape):
+    observation = {**along(1)[0], IMAGE: torch.rand(shape)}
+    with pytest.raises(ValueError, match=r"observation\.image has shape .*trained on \(3, \d+, \d+\).*crop"):
+        permissive.shield(observation, actions(LEFT))
+
+
+def test_image_of_another_size_is_averaged(permissive):
+    observation = {**along(1)[0], IMAGE: torch.rand(3, 3, 64, 64)}
+    assert permissive.shield(observation, actions(LEFT)).reason.eq(Reason.PASSED).all()
+
+
 @pytest.mark.parametrize(
     ("age_s", "stale"), [(0.0, False), (0.05, False), (0.051, True), (-0.01, True), (math.nan, True)]
 )
@@ -319,6 +331,23 @@ def test_fallback_keeps_its_grip(cache_meta, tmp_path):
         decision = policy.shield(seen, torch.tensor([[-1.0, 1.0]]))
         assert decision.intervened.all() and decision.action[0, 0] == pytest.approx(0.7, abs=1e-5)
     assert policy.shield(seen, torch.full((1, 2), torch.nan)).action[0, 0] == pytest.approx(0.7, abs=1e-5)
+
+
+def test_before_anything_was_executed_the_grip_is_that_which_is_seen(tmp_path):
+    """A kept command whose name the state has, in the same unit."""
+    from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+    from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, STATE_NAMES
+
+    policy = LatentSafePolicy.from_pretrained(tiny.save_franka_filter(tmp_path / "filter", epsilon=2.0))
+    assert "gripper.pos" in STATE_NAMES
+    state = torch.zeros(2, len(STATE_NAMES))
+    state[:, STATE_NAMES.index("gripper.pos")] = torch.tensor([0.8, 1.2])  # beyond what can be commanded
+    images = {f"observation.images.{name}": torch.rand(2, 3, 32, 32) for name in ("front", "wrist")}
+    nothing, broken = None, torch.full((2, len(ACTION_NAMES)), torch.nan)
+    for proposed in (nothing, broken):
+        policy.shield.reset()
+        decision = policy.shield({**images, "observation.state": state}, proposed)
+        torch.testing.assert_close(decision.action[:, ACTION_NAMES.index("gripper.pos")], torch.tensor([0.8, 1.0]))
 
 
 @pytest.mark.parametrize("law", ["plan", "margin"])

@@ -138,6 +138,19 @@ def test_joint_moves_are_held_back_unless_allowed(trained, caplog):
         assert set(robot.send_action(joints)) == set(joints)
 
 
+@pytest.mark.parametrize("opening", [1.0, 0.4])
+def test_at_the_first_tick_the_grip_is_held_as_it_is_seen(robot, opening):
+    """Nothing was executed yet, and nothing that could be is proposed: 0 would close the fingers."""
+    seen = robot.inner.get_observation()
+    seen["gripper.pos"] = opening
+    robot.inner.get_observation = lambda: seen
+    sent = robot.send_action(PUSH | {"delta_x.pos": float("nan")})
+    assert last(robot).intervened.item() and sent["gripper.pos"] == pytest.approx(opening, abs=1e-5)
+    robot._forget()
+    robot._sent.clear()
+    assert robot.send_action({"joint_1.pos": 0.1}) == pytest.approx(STILL | {"gripper.pos": opening})
+
+
 def test_what_stays_closed_stays_closed_through_moves_of_other_names(robot):
     robot.get_observation()
     robot.send_action(PUSH | {"gripper.pos": 0.25})
@@ -240,23 +253,28 @@ def test_shields_do_not_nest(trained, capsys):
     assert "invalid choice: 'latentsafe_shielded'" in capsys.readouterr().err
 
 
+def seen(**cameras):
+    """Input features of a filter whose pictures have these shapes."""
+    from lerobot.configs.types import FeatureType, PolicyFeature
+
+    images = {f"observation.images.{name}": PolicyFeature(FeatureType.VISUAL, shape) for name, shape in cameras.items()}
+    return {**images, "observation.state": PolicyFeature(FeatureType.STATE, (len(STATE_NAMES),))}
+
+
+SQUARE = (3, 32, 32)
+SIDE = {"cameras": ["observation.images.front", "observation.images.side"]}
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"cameras": ["observation.images.front", "observation.images.side"]}, "no camera side"),
+        ({**SIDE, "input_features": seen(front=SQUARE, side=SQUARE)}, "no camera side"),
+        ({"input_features": seen(front=SQUARE, wrist=(3, 24, 32))}, r"wrist has shape \(3, 32, 32\).*\(3, 24, 32\)"),
         ({"action_names": [*ACTION_NAMES[:-1], "hand.pos"], "kept_commands": []}, "acts in"),
         ({"state_names": [*STATE_NAMES[:-1], "weight.pos"]}, "does not observe weight.pos"),
     ],
 )
 def test_a_filter_of_another_robot_is_refused_before_anything_moves(tmp_path, changes, words):
-    from lerobot.configs.types import FeatureType, PolicyFeature
-
-    if "cameras" in changes:
-        image = PolicyFeature(FeatureType.VISUAL, (3, 32, 32))
-        changes["input_features"] = {
-            **dict.fromkeys(changes["cameras"], image),
-            "observation.state": PolicyFeature(FeatureType.STATE, (len(STATE_NAMES),)),
-        }
     other = tiny.save_franka_filter(tmp_path / "other", **changes)
     with pytest.raises(ValueError, match=words):
         make_robot_from_config(config(other))
@@ -321,13 +339,13 @@ def test_lerobots_own_commands_take_the_shielded_robot(trained, tmp_path, monkey
     }  # fmt: skip
     monkeypatch.setattr("sys.argv", ["lerobot-replay", *shielded_options(trained, **replayed)])
     lerobot_replay.main()
-    from lerobot_latentsafe.robots.shielded.journal import decision_columns
+    import pyarrow.parquet as pq
 
     dataset = LeRobotDataset("me/shielded", root=root)
     frames = int((np.array(dataset.hf_dataset["episode_index"]) == 0).sum())
-    found = decision_columns(journal, np.zeros(frames, int), np.arange(frames))
-    assert found["intervened"].all()
-    assert np.allclose(found["proposed"], np.array(dataset.hf_dataset["action"])[:frames], atol=1e-6)
+    rows = pq.read_table(journal).to_pylist()
+    assert [r["frame_index"] for r in rows] == list(range(frames)) and all(r["intervened"] for r in rows)
+    assert np.allclose([r["proposed"] for r in rows], np.array(dataset.hf_dataset["action"])[:frames], atol=1e-6)
 
 
 def test_a_journal_goes_on_and_forgets_what_is_recorded_again(tmp_path):
@@ -341,7 +359,7 @@ def test_a_journal_goes_on_and_forgets_what_is_recorded_again(tmp_path):
         journal.hear(announced)
         for value in values:
             judged = least_restrictive(torch.zeros(1, 2), torch.ones(1, 2), torch.tensor([value]), torch.ones(1), 0.0)
-            journal.add(judged)
+            journal.add(judged, [0.0, 1.0])
 
     path = tmp_path / "shield" / "decisions.parquet"
     first = Journal(path)
@@ -359,15 +377,32 @@ def test_a_journal_goes_on_and_forgets_what_is_recorded_again(tmp_path):
     assert rows == [(0, 0, 0.5, "passed"), (0, 1, -0.5, "unsafe_value"), (1, 0, 0.7, "passed")]
 
 
+def frames_of(*actions):
+    """An episode as a dataset stores it."""
+    n = len(actions)
+    return {"episode_index": np.zeros(n, int), "frame_index": np.arange(n), "action": np.array(actions, np.float32)}
+
+
 def test_decisions_of_another_dataset_are_refused(tmp_path):
-    from lerobot_latentsafe.robots.shielded.journal import decision_columns
+    from lerobot_latentsafe.filter import least_restrictive
+    from lerobot_latentsafe.robots.shielded.journal import Journal, decision_columns
 
     with pytest.raises(FileNotFoundError, match="latentsafe record"):
-        decision_columns(tmp_path / "none.parquet", np.zeros(1, int), np.zeros(1, int))
+        decision_columns(tmp_path / "none.parquet", frames_of([0.0, 1.0]))
     torn = tmp_path / "torn.parquet"
     torn.write_bytes(b"PAR1")
     with pytest.raises(ValueError, match="not a readable journal"):
-        decision_columns(torn, np.zeros(1, int), np.zeros(1, int))
+        decision_columns(torn, frames_of([0.0, 1.0]))
+    journal = Journal(tmp_path / "decisions.parquet")
+    judged = least_restrictive(torch.zeros(1, 2), torch.ones(1, 2), torch.ones(1), torch.ones(1), 0.0)
+    for executed in ([0.0, 1 / 3], [0.5, 1.0]):
+        journal.add(judged, executed)
+    journal.write()
+    assert decision_columns(journal.path, frames_of([0.0, 1 / 3], [0.5, 1.0]))["value"].tolist() == [1.0, 1.0]
+    with pytest.raises(ValueError, match=r"no decision for episode 0, frame 2.*another dataset"):
+        decision_columns(journal.path, frames_of([0.0, 1 / 3], [0.5, 1.0], [0.5, 1.0]))
+    with pytest.raises(ValueError, match=r"\[0\.5, 1\.0\] was executed in episode 0, frame 1.*another dataset"):
+        decision_columns(journal.path, frames_of([0.0, 1 / 3], [0.5, 0.9]))
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 """Token caches: what is read is what the encoder sees, whoever made it and however often it was killed."""
 
 import os
+import shutil
 import subprocess
 import sys
 
@@ -113,6 +114,25 @@ def test_training_without_a_token_cache_says_what_to_run(dataset_meta, dataset):
 def test_basis_of_pictures_is_refused(dataset, cache_root, tmp_path):
     with pytest.raises(FrameCacheError, match="do not fit"):
         build_frame_cache(dataset, tmp_path / "new", tiny.TOKEN_SIZE, tiny.tokens(basis_from=cache_root))
+
+
+@pytest.fixture
+def two_cameras(token_root, tmp_path):
+    """A copy of the token cache that claims to see by one more camera."""
+    root = shutil.copytree(token_root, tmp_path / "two")
+    cameras = FrameCache.open(root).manifest["cameras"]
+    tiny.rewrite_json(root / "frame_cache" / "manifest.json", cameras={**cameras, "observation.side": [32, 32, 3]})
+    return root
+
+
+def test_tokens_of_more_cameras_than_the_filter_sees_are_refused(two_cameras):
+    with pytest.raises(FrameCacheError, match=r"tokens of observation\.image, observation\.side side by side"):
+        tiny.new_policy(tiny.metadata(two_cameras), world_model=tiny.gru_config(), cameras=["observation.image"])
+
+
+def test_basis_of_other_cameras_is_refused(dataset, two_cameras, tmp_path):
+    with pytest.raises(FrameCacheError, match=r"sees observation\.image, observation\.side, this dataset"):
+        build_frame_cache(dataset, tmp_path / "new", tiny.TOKEN_SIZE, tiny.tokens(basis_from=two_cameras))
 
 
 def test_unknown_dtype_is_refused(dataset, tmp_path):

@@ -120,6 +120,11 @@ class Tokens:
                     f"the cache in {self.basis_from} was made by {other.manifest.get('encoder')}, not by "
                     f"{self.manifest['encoder']} with the same weights; their principal components do not fit"
                 )
+            if sorted(other.manifest["cameras"]) != self.perception.image_keys:
+                raise FrameCacheError(
+                    f"the cache in {self.basis_from} sees {', '.join(sorted(other.manifest['cameras']))}, this dataset "
+                    f"has {', '.join(self.perception.image_keys)}; their principal components do not fit"
+                )
             shutil.copyfile(Path(self.basis_from) / FOLDER / BASIS, folder / BASIS)
             return
         rng = np.random.default_rng(0)

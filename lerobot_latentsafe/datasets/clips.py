@@ -8,7 +8,7 @@ import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
 from torch import Tensor
 
-from lerobot_latentsafe.datasets.frame_cache import FOLDER, FrameCache, FrameCacheError
+from lerobot_latentsafe.datasets.frame_cache import FOLDER, FrameCache, FrameCacheError, check_proportions
 from lerobot_latentsafe.datasets.labels import FailureLabels
 from lerobot_latentsafe.world_models.base import Clip
 
@@ -33,7 +33,8 @@ class ClipReader:
 
         Raises:
             UnlabelledDatasetError: no failure labels.
-            FrameCacheError: a torn cache, one of another dataset or of another image size, or no camera at all.
+            FrameCacheError: a torn cache, one of another dataset, of another image size or of tokens of more cameras.
+            ValueError: no camera at all, none of that name, or one of other proportions than those trained on.
         """
         labels = FailureLabels.load(meta.root, config.failure_specification)
         if len(labels.failure) != meta.total_frames:
@@ -61,8 +62,15 @@ class ClipReader:
                 f"{meta.repo_id} lacks the camera {', '.join(missing) or 'images'}: it has "
                 f"{', '.join(cameras) or 'none'}. Record it, or name the cameras to use with --policy.cameras"
             )
+        if cache is not None and "encoder_hash" in cache.manifest and set(cameras) != set(config.cameras):
+            raise FrameCacheError(
+                f"cache {folder} holds the tokens of {', '.join(cameras)} side by side, the filter sees "
+                f"{', '.join(config.cameras)} alone; cache a copy of the dataset with these cameras only"
+            )
         for key in config.cameras:
             height, width, channels = cameras[key]
+            if key in config.input_features:
+                check_proportions(key, (channels, height, width), config.input_features[key].shape)
             config.input_features[key] = PolicyFeature(FeatureType.VISUAL, (channels, height, width))
         return cls(labels, cache, config.world_model.clip_length)
 

@@ -44,6 +44,22 @@ def to_model_images(images: Tensor, size: int) -> Tensor:
     return (images + 1e-3).round() / 255.0  # the offset keeps x.5 from rounding by float noise
 
 
+def check_proportions(key: str, shape: tuple[int, ...], trained: tuple[int, ...]) -> None:
+    """Pictures of any size are averaged to the model's, but not stretched: refuse other proportions than in training.
+
+    Args:
+        shape, trained: (C, H, W) of the pictures now and of those that the filter was trained on.
+
+    Raises:
+        ValueError: naming both.
+    """
+    if len(shape) != 3 or shape[0] != trained[0] or shape[1] * trained[2] != shape[2] * trained[1]:
+        raise ValueError(
+            f"{key} has shape {tuple(shape)}, the filter was trained on {tuple(trained)} (channels, height, width); "
+            "crop the pictures to these proportions, or train a filter on data of this camera"
+        )
+
+
 def dataset_fingerprint(meta: "LeRobotDatasetMetadata") -> str:
     """Identifies a dataset by all but its cameras, so that a copy without images has the same one."""
     features = {k: [v["dtype"], list(v["shape"])] for k, v in meta.features.items() if k not in meta.camera_keys}

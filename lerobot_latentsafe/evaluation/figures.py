@@ -82,26 +82,71 @@ def value_trace(trace: dict[str, list], epsilon: float) -> Figure:
     return figure
 
 
+def severity(lost: dict[str, list[int]], n_candies: int) -> Figure:
+    """Share of runs that spill at least p% of the candies, over p.
+
+    Args:
+        lost: name -> candies lost in each run; `who, shielded` is drawn in the colour of `who`, solid, others dashed.
+    """
+    figure, ax = plt.subplots(figsize=(5.6, 3.4))
+    level = np.array([1, *range(1, n_candies + 1)])  # any candy at all, then one more a step
+    p = 100 * np.arange(n_candies + 1) / n_candies
+    colours = {who: f"C{i}" for i, who in enumerate(dict.fromkeys(name.split(",")[0] for name in lost))}
+    for name, candies in lost.items():
+        share = (np.asarray(candies) >= level[:, None]).mean(1)
+        style, colour = "-" if name.endswith("shielded") else "--", colours[name.split(",")[0]]
+        ax.step(p, share, style, where="pre", color=colour, label=f"{name} (n = {len(candies)})")
+    ax.set(
+        xlabel="p, share of the candies (%)", ylabel="runs that spill at least p%", xlim=(0, 100), ylim=(-0.02, 1.02)
+    )
+    ax.legend(fontsize=8)
+    return figure
+
+
+def value_profiles(panels: dict[str, list[dict[str, list]]], epsilon: float, fps: int) -> Figure:
+    """V over time, a panel a situation: orange where the filter acts, grey lines where a candy first falls out.
+
+    Args:
+        panels: title -> episodes, each with value, intervened and spilled (candies outside) step by step.
+    """
+    figure, axes = plt.subplots(1, len(panels), figsize=(2.7 * len(panels), 2.6), sharey=True, squeeze=False)
+    for ax, (title, episodes) in zip(axes[0], panels.items()):
+        for episode in episodes:
+            value, acted = np.array(episode["value"]), np.array(episode["intervened"], bool)
+            t, spilled = np.arange(len(value)) / fps, np.flatnonzero(episode["spilled"])
+            ax.plot(t, value, color="tab:blue", lw=1, alpha=0.8)
+            ax.plot(t[acted], value[acted], ".", color="tab:orange", ms=4)
+            for first in spilled[:1]:
+                ax.axvline(t[first], color="0.6", lw=1)
+        ax.axhline(epsilon, color="k", lw=0.8, ls="--")
+        ax.set(title=title, xlabel="time (s)", ylim=(-1.05, 1.05))
+    axes[0, 0].set(ylabel=f"V (dashed: epsilon = {epsilon:g})")
+    figure.tight_layout()
+    return figure
+
+
 def write_videos(runs: dict[str, Episodes], folder: str | Path, fps: int = dubins.FPS) -> list[Path]:
     """One mp4 an episode, bare and shielded side by side, an orange frame while the filter acts."""
+    paths = []
+    for i in range(min(len(r.frames) for r in runs.values())):
+        columns = {name: (r.frames[i], r.traces[i].get("intervened", [])) for name, r in runs.items()}
+        paths.append(write_side_by_side(columns, Path(folder) / f"episode_{i:03d}.mp4", fps))
+    return paths
+
+
+def write_side_by_side(columns: dict[str, tuple[list[np.ndarray], list[bool]]], path: Path, fps: int) -> Path:
+    """An mp4 of runs beside each other: name -> RGB frames, and at which of them the filter acts."""
     import cv2
     from lerobot.utils.io_utils import write_video
 
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = []
-    for i in range(min(len(r.frames) for r in runs.values())):
-        length = max(len(r.frames[i]) for r in runs.values())
-        columns = []
-        for name, r in runs.items():
-            frames = [cv2.resize(f, (256, 256), interpolation=cv2.INTER_NEAREST) for f in r.frames[i]]
-            for t, frame in enumerate(frames):
-                cv2.putText(frame, name, (8, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (40, 40, 40), 1, cv2.LINE_AA)
-                acted = r.traces[i].get("intervened", [])
-                if t < len(acted) and acted[t]:
-                    cv2.rectangle(frame, (0, 0), (255, 255), (255, 140, 0), 6)
-            columns.append(frames + [frames[-1]] * (length - len(frames)))
-        path = folder / f"episode_{i:03d}.mp4"
-        write_video(str(path), [np.concatenate(pair, 1) for pair in zip(*columns)], fps)
-        paths.append(path)
-    return paths
+    path.parent.mkdir(parents=True, exist_ok=True)
+    length, drawn = max(len(frames) for frames, _ in columns.values()), []
+    for name, (frames, acted) in columns.items():
+        frames = [cv2.resize(f, (256, 256), interpolation=cv2.INTER_NEAREST) for f in frames]
+        for t, frame in enumerate(frames):
+            cv2.putText(frame, name, (8, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (40, 40, 40), 1, cv2.LINE_AA)
+            if t < len(acted) and acted[t]:
+                cv2.rectangle(frame, (0, 0), (255, 255), (255, 140, 0), 6)
+        drawn.append(frames + [frames[-1]] * (length - len(frames)))
+    write_video(str(path), [np.concatenate(pair, 1) for pair in zip(*drawn)], fps)
+    return path

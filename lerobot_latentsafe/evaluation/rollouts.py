@@ -3,10 +3,15 @@
 import json
 import os
 import platform
+import re
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from datetime import date
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -24,12 +29,13 @@ def wilson(k: int, n: int, confidence: float = 0.95) -> dict[str, float]:
     return {"k": int(k), "n": int(n), "low": float(interval.low), "high": float(interval.high)}
 
 
-def mcnemar(before: np.ndarray, after: np.ndarray) -> float:
-    """Exact McNemar test of paired outcomes, bool (N,) each: the p-value of both being as frequent."""
+def paired_p_value(first: np.ndarray, second: np.ndarray) -> float:
+    """Exact McNemar test on pairs of outcomes, bool (N,) each: how likely so lopsided a difference is by chance."""
     from scipy.stats import binomtest
 
-    lost, gained = int((before & ~after).sum()), int((~before & after).sum())
-    return float(binomtest(gained, lost + gained).pvalue) if lost + gained else 1.0
+    first, second = np.asarray(first, bool), np.asarray(second, bool)
+    gone, come = int((first & ~second).sum()), int((~first & second).sum())
+    return float(binomtest(come, gone + come).pvalue) if gone + come else 1.0
 
 
 def confusion(predicted_safe: np.ndarray, truly_safe: np.ndarray) -> dict[str, float]:
@@ -78,7 +84,57 @@ def provenance(seeds: list[int], cpu_minutes: float | None = None) -> dict:
 
 
 def write_json(path: str | Path, content: dict) -> None:
-    """Write results, making folders as needed."""
+    """Write results, lists of numbers on one line, making folders as needed."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(content, indent=2) + "\n")
+    text = json.dumps(content, indent=2)
+    text = re.sub(r'\[\n([^\[\]{}":]*)\]', lambda numbers: f"[{' '.join(numbers[1].split())}]", text)
+    path.write_text(text + "\n")
+
+
+def run_resumable(path: Path, jobs: list[dict], run: Callable[[dict], dict], workers: int = 1) -> list[dict]:
+    """Rows of all jobs, in their order; each is kept in a file as soon as it ends, so that a killed run goes on.
+
+    Args:
+        path: of a JSONL file, a job and its row a line; jobs that it holds are not run again.
+        jobs: JSON-able, and all that a row depends on.
+        run: job -> JSON-able row; a function of a module, if there are several workers.
+        workers: processes.
+
+    Returns:
+        What `run` returned, and cpu_s, its CPU seconds.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows = dict(_kept_rows(path))
+    missing = [job for job in jobs if _key(job) not in rows]
+    with ExitStack() as stack:
+        stream = stack.enter_context(path.open("a"))
+        apply = stack.enter_context(get_context("spawn").Pool(workers)).imap_unordered if workers > 1 else map
+        for done, (job, row) in enumerate(apply(partial(_ran, run), missing), 1):
+            stream.write(json.dumps({"job": job, "row": row}) + "\n")
+            stream.flush()
+            rows[_key(job)] = row
+            print(f"\r{done} of {len(missing)} episodes", end="\n" if done == len(missing) else "", flush=True)
+    return [rows[_key(job)] for job in jobs]
+
+
+def _ran(run: Callable[[dict], dict], job: dict) -> tuple[dict, dict]:
+    began = time.process_time()
+    row = run(job)
+    return job, {**row, "cpu_s": round(time.process_time() - began, 3)}
+
+
+def _key(job: dict) -> str:
+    return json.dumps(job, sort_keys=True)
+
+
+def _kept_rows(path: Path) -> Iterator[tuple[str, dict]]:
+    """The rows of a file; its last line may be torn, and is then cut off."""
+    if not path.exists():
+        return
+    *lines, torn = path.read_text().split("\n")
+    if torn:
+        os.truncate(path, path.stat().st_size - len(torn.encode()))
+    for line in lines:
+        entry = json.loads(line)
+        yield _key(entry["job"]), entry["row"]

@@ -7,7 +7,7 @@ import torch
 from lerobot.envs import make_env, preprocess_observation
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_latentsafe.evaluation.rollouts import mcnemar, wilson
+from lerobot_latentsafe.evaluation.rollouts import paired_p_value, wilson
 from lerobot_latentsafe.filter import FilterDecision, Reason
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.shield import BasePolicy
@@ -177,7 +177,7 @@ def compare(policy: LatentSafePolicy, env: EnvConfig, n_episodes: int, seed: int
     return {
         "bare": bare.rates(),
         "shielded": shielded.rates(),
-        "violation_p_value": mcnemar(bare.violation, shielded.violation),
+        "violation_p_value": paired_p_value(bare.violation, shielded.violation),
         "reasons": {reason.name.lower(): int(reasons[reason]) for reason in Reason if reasons[reason]},
         "episodes": {"bare": bare, "shielded": shielded},
     }

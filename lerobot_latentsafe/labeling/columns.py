@@ -46,8 +46,7 @@ def write_decisions(dataset: "LeRobotDataset", output_dir: str | Path, repo_id: 
     from lerobot_latentsafe.robots.shielded.journal import FILE, decision_columns
 
     _refuse_existing(output_dir)
-    frames = read_frames(dataset.root, ["frame_index"])
-    found = decision_columns(Path(dataset.root) / FILE, frames["episode_index"], frames["frame_index"])
+    found = decision_columns(Path(dataset.root) / FILE, read_frames(dataset.root, ["frame_index", "action"]))
     columns = {}
     for name, values in found.items():
         names = dataset.meta.features["action"]["names"] if name == "proposed" else None

@@ -16,8 +16,9 @@ FILE = Path("shield") / "decisions.parquet"
 class Journal:
     """Rows of decisions by episode and frame, written to a parquet file after every episode.
 
-    Columns: episode_index, frame_index, proposed (list of float, robot units), value, margin, intervened, reason (the
-    name of a `Reason`). Frames count from 0 in each episode; the pauses between episodes leave no rows.
+    Columns: episode_index, frame_index, proposed and executed (lists of float, robot units), value, margin, intervened,
+    reason (the name of a `Reason`). What was executed tells which dataset it belongs to. Frames count from 0 in each
+    episode; the pauses between episodes leave no rows.
     """
 
     def __init__(self, path: Path):
@@ -36,8 +37,8 @@ class Journal:
         if self.episode is not None:
             self.episodes[self.episode] = []
 
-    def add(self, decision: FilterDecision) -> None:
-        """Note the decision on the next frame (batch of one)."""
+    def add(self, decision: FilterDecision, executed: list[float]) -> None:
+        """Note the decision on the next frame (batch of one), and what the robot made of it."""
         if self.episode is None:
             return
         rows = self.episodes.setdefault(self.episode, [])
@@ -46,6 +47,7 @@ class Journal:
                 "episode_index": self.episode,
                 "frame_index": len(rows),
                 "proposed": decision.proposed[0].tolist(),
+                "executed": executed,
                 "value": decision.value.item(),
                 "margin": decision.margin.item(),
                 "intervened": bool(decision.intervened.item()),
@@ -85,29 +87,24 @@ def _read(path: Path):
         raise ValueError(f"{path} is not a readable journal of decisions ({e}); move it away") from e
 
 
-def decision_columns(path: Path, episode: np.ndarray, frame: np.ndarray) -> dict[str, np.ndarray]:
+def decision_columns(path: Path, frames: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """A journal's columns for the frames of a dataset, in their order.
 
     Args:
-        episode, frame: (N,) the indices of the dataset's frames.
+        frames: episode_index, frame_index (N,) and action (N, A) of the dataset.
 
     Returns:
         proposed (N, A) and value, margin (N,) float32; intervened, reason (N,) int64.
 
     Raises:
-        ValueError: the journal lacks a frame: it belongs to another dataset.
+        ValueError: the journal lacks a frame, or holds other actions: it belongs to another dataset.
         FileNotFoundError: there is no journal.
     """
     if not Path(path).exists():
         raise FileNotFoundError(f"{path} does not exist; record with `latentsafe record` to get one")
     rows = {(row["episode_index"], row["frame_index"]): row for row in _read(path).to_pylist()}
-    wanted = list(zip(episode.tolist(), frame.tolist()))
-    missing = [key for key in wanted if key not in rows]
-    if missing:
-        raise ValueError(
-            f"{path} holds no decision for episode {missing[0][0]}, frame {missing[0][1]} and {len(missing) - 1} more "
-            "frames; it belongs to another dataset"
-        )
+    wanted = list(zip(frames["episode_index"].tolist(), frames["frame_index"].tolist()))
+    _check_dataset(path, rows, wanted, frames["action"])
     found = [rows[key] for key in wanted]
     return {
         "proposed": np.array([row["proposed"] for row in found], np.float32),
@@ -116,3 +113,19 @@ def decision_columns(path: Path, episode: np.ndarray, frame: np.ndarray) -> dict
         "intervened": np.array([row["intervened"] for row in found], np.int64),
         "reason": np.array([Reason[row["reason"].upper()] for row in found], np.int64),
     }
+
+
+def _check_dataset(path: Path, rows: dict[tuple, dict], wanted: list[tuple], action: np.ndarray) -> None:
+    missing = [key for key in wanted if key not in rows]
+    if missing:
+        raise ValueError(
+            f"{path} holds no decision for episode {missing[0][0]}, frame {missing[0][1]} and {len(missing) - 1} more "
+            "frames; it belongs to another dataset"
+        )
+    for key, stored in zip(wanted, action):
+        executed = rows[key].get("executed")
+        if executed is None or not np.allclose(executed, stored, rtol=1e-5, atol=1e-6):
+            raise ValueError(
+                f"{path} says that {executed} was executed in episode {key[0]}, frame {key[1]}, the dataset "
+                f"{stored.tolist()}; it belongs to another dataset. Put the journal of this recording there"
+            )

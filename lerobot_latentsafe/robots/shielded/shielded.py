@@ -15,6 +15,7 @@ from lerobot.robots.utils import make_robot_from_config
 from lerobot.utils.constants import OBS_IMAGES, OBS_STATE, OBS_STR
 from lerobot.utils.feature_utils import build_dataset_frame
 
+from lerobot_latentsafe.datasets.frame_cache import check_proportions
 from lerobot_latentsafe.filter import FilterDecision, Reason
 from lerobot_latentsafe.robots.announcements import Announcements
 from lerobot_latentsafe.robots.shielded.config_shielded import LatentSafeShieldedConfig
@@ -75,6 +76,9 @@ class LatentSafeShielded(Robot):
                 f"{', '.join(wanted)}, the robot has {', '.join(cameras) or 'none'}. Name its cameras alike, or "
                 "train a filter for this robot"
             )
+        for name in wanted:
+            key, (height, width, channels) = f"{OBS_IMAGES}.{name}", robot.observation_features[name]
+            check_proportions(key, (channels, height, width), config.input_features[key].shape)
         acts_in, offered = set(config.action_names), set(robot.action_features)
         if acts_in != offered:
             raise ValueError(
@@ -170,9 +174,12 @@ class LatentSafeShielded(Robot):
         early, self._sent_early = self._sent_early, None
         if early is not None and action == early:
             return early
+        shield, names = self.filter.shield, self.filter.config.action_names
+        before = shield.decision
         sent = self.inner.send_action(self._decide(action))
         self._sent.update(sent)
-        shield, names = self.filter.shield, self.filter.config.action_names
+        if self.journal and shield.decision is not None and shield.decision is not before:
+            self.journal.add(shield.decision, [float(sent[name]) for name in names])
         if set(sent) == set(names) and shield.executed is not None:  # the robot may have clipped it
             executed = torch.tensor([[float(sent[name]) for name in names]], device=self.filter.device)
             shield.executed = self.filter.normalise_action(executed).nan_to_num(0.0).clamp(-1, 1)
@@ -223,9 +230,7 @@ class LatentSafeShielded(Robot):
         return isinstance(self._phase, str)
 
     def _carry_out(self, decision: FilterDecision, action: dict[str, float]) -> dict[str, float]:
-        """The action of a decision on an action, noted in the journal."""
-        if self.journal:
-            self.journal.add(decision)
+        """The action of a decision on an action."""
         if not decision.intervened.item():
             return action
         if isinstance(self._phase, int) and not self._early:
@@ -241,7 +246,9 @@ class LatentSafeShielded(Robot):
             "the robot holds still. --robot.unfiltered_moves=true lets such moves pass unfiltered"
         )
         self._decided_at = -math.inf
-        config, now = self.filter.config, {**(self._observation or {}), **self._sent}
+        if self._observation is None:
+            self.get_observation()
+        config, now = self.filter.config, {**self._observation, **self._sent}
         still = dict(zip(config.action_names, self.filter.hold_action(1)[0].tolist()))
         return {**still, **{name: float(now[name]) for name in config.kept_commands if name in now}}
 

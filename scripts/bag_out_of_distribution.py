@@ -1,0 +1,109 @@
+#!/usr/bin/env python
+"""Unsafe recordings are replayed on bags that the filter never saw: other colours, table, stiffness, weight.
+
+    scripts/bag_out_of_distribution.py --filters <filter> ... --n=50
+
+From each start a careless operator lifts the red bag by its closed end, unfiltered. What they commanded is then
+replayed, as it is, on every variant, bare and under each filter. Writes results/bag/out_of_distribution.json: spills,
+candies lost, steps overridden, step of the first override; and out_of_distribution.png beside it, V along the first
+starts under the first filter. Each run is kept in a .jsonl beside the output: a killed experiment goes on.
+"""
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import asdict
+from functools import cache, lru_cache
+from itertools import batched
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from lerobot_latentsafe.configuration_latentsafe import LAWS
+from lerobot_latentsafe.envs.bag import VARIANTS, BagScene
+from lerobot_latentsafe.evaluation.bag import (
+    FIRST_SEED,
+    FilterSetting,
+    against_bare,
+    drive,
+    in_short,
+    summary,
+    traces,
+)
+from lerobot_latentsafe.evaluation.figures import save, value_profiles
+from lerobot_latentsafe.evaluation.rollouts import provenance, run_resumable, write_json
+from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+from lerobot_latentsafe.teleoperators.scripted.behaviors import Actions, begin
+
+SEEN = "red"
+UNSEEN = [name for name in VARIANTS if name not in (SEEN, "sealed")]
+
+scene = cache(BagScene)
+
+
+@lru_cache(maxsize=2)
+def load(setting: FilterSetting) -> LatentSafePolicy:
+    torch.set_num_threads(1)
+    return setting.load()
+
+
+@lru_cache(maxsize=128)
+def recording(seed: int) -> tuple[np.ndarray, ...]:
+    """The actions of an unfiltered operator on the bag that the filter knows."""
+    red, actions = scene(SEEN), []
+    red.reset(seed)
+    drive(red, None, _noted(begin("closed_end", red, None, np.random.default_rng([0, seed])), actions))
+    return tuple(actions)
+
+
+def _noted(operator: Actions, actions: list[np.ndarray]) -> Iterator[np.ndarray]:
+    for action in operator:
+        actions.append(action)
+        yield action
+
+
+def run(job: dict) -> dict:
+    """One replay, see `drive`."""
+    policy = load(FilterSetting(**job["filter"])) if job["filter"] else None
+    actions = iter(recording(job["seed"]))
+    scene(job["variant"]).reset(job["seed"])
+    return drive(scene(job["variant"]), policy, actions)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--filters", nargs="+", required=True)
+    parser.add_argument("--law", choices=LAWS, default=LAWS[0])
+    parser.add_argument("--n", type=int, default=50)
+    parser.add_argument("--epsilon", type=float)
+    parser.add_argument("--guard", type=int)
+    parser.add_argument("--workers", type=int, default=1, help="processes")
+    parser.add_argument("--output", type=Path, default=Path("results/bag/out_of_distribution.json"))
+    arguments = parser.parse_args()
+    chosen = arguments.law, arguments.epsilon, arguments.guard
+    settings = [FilterSetting.of(path, *chosen) for path in arguments.filters]
+    seeds = [FIRST_SEED + i for i in range(arguments.n)]
+    cells = [(setting, variant) for setting in (None, *settings) for variant in (SEEN, *UNSEEN)]
+    jobs = [
+        {"variant": variant, "filter": asdict(setting) if setting else None, "seed": seed}
+        for setting, variant in cells
+        for seed in seeds
+    ]
+    rows = run_resumable(arguments.output.with_suffix(".jsonl"), jobs, run, arguments.workers)
+    runs = dict(zip(cells, map(list, batched(rows, len(seeds)))))
+
+    table, n_candies = {}, scene(SEEN).n_candies
+    for variant in (SEEN, *UNSEEN):
+        bare, shielded = runs[None, variant], {setting.path: runs[setting, variant] for setting in settings}
+        table[variant] = {"bare": summary(bare, n_candies), **against_bare(bare, shielded, n_candies)}
+        for name, cell in table[variant].items():
+            print(f"{variant}, {name}: {in_short(cell)}")
+    panels = {variant: traces(runs[settings[0], variant]) for variant in table}
+    save(value_profiles(panels, settings[0].epsilon, scene(SEEN).fps), arguments.output.with_suffix(".png"))
+    used = {s.path: {"law": s.law, "epsilon": s.epsilon, "guard": s.guard} for s in settings}
+    cpu_minutes = sum(row["cpu_s"] for row in rows) / 60
+    write_json(arguments.output, {**table, "filters": used, **provenance([seeds[0], seeds[-1]], cpu_minutes)})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,132 @@
+#!/usr/bin/env python
+"""A weak and a strong diffusion policy lift the bag, bare and under the same filters, from the same starts.
+
+    scripts/bag_policies.py --weak=bag_diffusion_weak --strong=bag_diffusion_strong --filters <filter> ... --n=100
+
+Writes results/bag/policies.json: for each policy bare, and under each law and filter, runs that spill, candies lost,
+success, steps overridden, step of the first override, CPU time of a decision; and severity.png beside it, how many runs
+spill at least p% of the candies. Each run is kept in a .jsonl beside the output: a killed experiment goes on.
+"""
+
+import argparse
+from dataclasses import asdict
+from functools import cache, lru_cache
+from itertools import batched
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from lerobot_latentsafe.configuration_latentsafe import LAWS
+from lerobot_latentsafe.envs.bag import BagScene
+from lerobot_latentsafe.evaluation.bag import (
+    FIRST_SEED,
+    FilterSetting,
+    against_bare,
+    drive,
+    fingerprint,
+    in_short,
+    summary,
+)
+from lerobot_latentsafe.evaluation.figures import save, severity, write_side_by_side
+from lerobot_latentsafe.evaluation.rollouts import provenance, run_resumable, write_json
+from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+from lerobot_latentsafe.shield import BasePolicy
+
+scene = cache(BagScene)
+
+
+@lru_cache(maxsize=2)
+def actor(base: str, setting: FilterSetting | None) -> BasePolicy | LatentSafePolicy:
+    """A policy, bare or under a filter."""
+    torch.set_num_threads(1)
+    return setting.load(base) if setting else BasePolicy(base, "cpu")
+
+
+def job(base: str, setting: FilterSetting | None, seed: int) -> dict:
+    """All that a run depends on."""
+    filtered = asdict(setting) if setting else None
+    return {"base": base, "base_fingerprint": fingerprint(base), "filter": filtered, "seed": seed}
+
+
+def run(job: dict, frames: list[np.ndarray] | None = None) -> dict:
+    """One episode, see `drive`."""
+    acting = actor(job["base"], FilterSetting(**job["filter"]) if job["filter"] else None)
+    scene().reset(job["seed"])
+    torch.manual_seed(job["seed"])  # a diffusion policy samples
+    return drive(scene(), acting, frames=frames)
+
+
+def film(name: str, bare: dict, shielded: dict, folder: Path) -> Path:
+    """Two runs side by side, driven once more."""
+    columns = {}
+    for column, one in (("bare", bare), ("shielded", shielded)):
+        frames: list[np.ndarray] = []
+        columns[column] = (frames, run(one, frames)["intervened"])
+    return write_side_by_side(columns, folder / f"{name}_{bare['seed']}.mp4", scene().fps)
+
+
+def tabulate(bare: list[dict], shielded: dict[FilterSetting, list[dict]]) -> dict:
+    """The results of one policy: bare, and law -> filter -> what it changes."""
+    table = {"bare": summary(bare, scene().n_candies)}
+    for law in dict.fromkeys(setting.law for setting in shielded):
+        rows = {setting.path: runs for setting, runs in shielded.items() if setting.law == law}
+        table[law] = against_bare(bare, rows, scene().n_candies)
+    return table
+
+
+def draw(table: dict[str, dict], law: str, path: Path) -> None:
+    """How many runs spill at least p%, bare and under the filters of a law together."""
+    lost = {}
+    for who, cells in table.items():
+        lost |= {who: cells["bare"]["lost"], f"{who}, shielded": cells[law]["pooled"]["lost"]}
+    save(severity(lost, scene().n_candies), path)
+
+
+def parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--weak", help="policy that learnt from careless demonstrations")
+    parser.add_argument("--strong", help="policy that learnt from careful ones")
+    parser.add_argument("--filters", nargs="+", required=True)
+    parser.add_argument("--laws", nargs="+", choices=LAWS, default=list(LAWS))
+    parser.add_argument("--n", type=int, default=100)
+    parser.add_argument("--epsilon", type=float)
+    parser.add_argument("--guard", type=int)
+    parser.add_argument("--workers", type=int, default=1, help="processes")
+    parser.add_argument(
+        "--n_videos", type=int, default=0, help="starts to film, bare and under the first law and filter"
+    )
+    parser.add_argument("--output", type=Path, default=Path("results/bag/policies.json"))
+    arguments = parser.parse_args()
+    if not (arguments.weak or arguments.strong):
+        parser.error("no policy to shield: give --weak, --strong or both")
+    return arguments
+
+
+def main() -> None:
+    arguments = parse()
+    bases = {name: path for name in ("weak", "strong") if (path := getattr(arguments, name))}
+    pairs = [(law, path) for law in arguments.laws for path in arguments.filters]
+    settings = [FilterSetting.of(path, law, arguments.epsilon, arguments.guard) for law, path in pairs]
+    seeds = [FIRST_SEED + i for i in range(arguments.n)]
+    cells = [(who, setting) for who in bases for setting in (None, *settings)]
+    jobs = [job(bases[who], setting, seed) for who, setting in cells for seed in seeds]
+    rows = run_resumable(arguments.output.with_suffix(".jsonl"), jobs, run, arguments.workers)
+    runs = dict(zip(cells, map(list, batched(rows, len(seeds)))))
+
+    table = {who: tabulate(runs[who, None], {s: runs[who, s] for s in settings}) for who in bases}
+    for who, laws in table.items():
+        print(f"{who}, bare: {in_short(laws['bare'])}")
+        for law, path in pairs:
+            print(f"{who}, {law} of {path}: {in_short(laws[law][path])}")
+    draw(table, arguments.laws[0], arguments.output.with_name("severity.png"))
+    used = {s.path: {"epsilon": s.epsilon, "guard": s.guard} for s in settings}
+    cpu_minutes = sum(row["cpu_s"] for row in rows) / 60
+    write_json(arguments.output, {**table, "filters": used, **provenance([seeds[0], seeds[-1]], cpu_minutes)})
+    for who, base in bases.items():
+        for seed in seeds[: arguments.n_videos]:
+            print(film(who, job(base, None, seed), job(base, settings[0], seed), arguments.output.parent / "videos"))
+
+
+if __name__ == "__main__":
+    main()

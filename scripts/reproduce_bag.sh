@@ -1,0 +1,69 @@
+#!/usr/bin/env bash
+# The filter of the bag and the policies it shields, from nothing, resumable: a step whose output exists is skipped.
+#   scripts/reproduce_bag.sh [OUT]     OUT defaults to outputs/bag; recordings go to data, or to $DATA
+set -euo pipefail
+cd "$(dirname "$0")/.."
+OUT=${1:-outputs/bag} DATA=${DATA:-data} SEEDS=${SEEDS:-0 1 2}
+BIN=.venv/bin
+export HF_HUB_OFFLINE=1 OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
+mkdir -p "$OUT"
+
+record() { # name source seed [episodes]
+  [ -e "$DATA/$1" ] || $BIN/latentsafe collect --source="$2" --repo_id="latentsafe/$1" --root="$DATA/$1" --seed="$3" \
+    ${4:+--n_episodes="$4"}
+}
+
+tokens() { # name [other options of latentsafe cache]
+  local name=$1; shift
+  [ -e "$DATA/${name}_tokens/frame_cache/manifest.json" ] || $BIN/latentsafe cache --encoder=auto \
+    --dataset.repo_id="latentsafe/$name" --dataset.root="$DATA/$name" --output_dir="$DATA/${name}_tokens" "$@"
+}
+
+filter() { # seed
+  local wm="$OUT/wm_$1" data="--dataset.repo_id=latentsafe/bag_cache --dataset.root=$DATA/bag_tokens"
+  local last="$wm/checkpoints/last/pretrained_model"
+  if [ -e "$wm/checkpoints/last" ] && [ ! -e "$wm/done" ]; then
+    $BIN/lerobot-train --config_path="$last/train_config.json" --resume=true
+  elif [ ! -e "$wm/done" ]; then
+    rm -rf "$wm"
+    $BIN/lerobot-train --config_path=configs/bag_gru.yaml $data --policy.frame_cache="$DATA/bag_tokens" \
+      --output_dir="$wm" --seed="$1"
+  fi
+  touch "$wm/done"
+  [ -e "$OUT/margin_$1/integrity.json" ] || $BIN/latentsafe train-margin --policy.path="$last" $data \
+    --output_dir="$OUT/margin_$1" --seed="$1"
+  [ -e "$OUT/filter_$1/integrity.json" ] || $BIN/latentsafe train-reachability --policy.path="$OUT/margin_$1" $data \
+    --output_dir="$OUT/filter_$1" --seeds="[$1]"
+}
+
+record bag_mix bag_mix 0
+record bag_branches bag_branches 0
+record bag_climbs_0 bag_climbs 0
+record bag_climbs_2 bag_climbs 2
+record held_branches bag_branches 1 150
+record held_lifts bag_lifts 1 120
+[ -e "$DATA/bag" ] || $BIN/python - "$DATA" <<'EOF'
+import sys
+from pathlib import Path
+from lerobot.datasets.aggregate import aggregate_datasets
+data, parts = Path(sys.argv[1]), ["bag_mix", "bag_branches", "bag_climbs_0", "bag_climbs_2"]
+aggregate_datasets([f"latentsafe/{p}" for p in parts], "latentsafe/bag", [data / p for p in parts], data / "bag.begun")
+(data / "bag.begun").rename(data / "bag")
+EOF
+tokens bag
+for held in held_branches held_lifts; do tokens "$held" --basis_from="$DATA/bag_tokens"; done
+
+for seed in $SEEDS; do
+  filter "$seed"
+  for held in branches lifts; do
+    [ -e "results/bag/world_model_${held}_$seed.json" ] || $BIN/latentsafe eval-world-model \
+      --policy.path="$OUT/filter_$seed" --dataset.repo_id="latentsafe/held_${held}_cache" \
+      --dataset.root="$DATA/held_${held}_tokens" --json="results/bag/world_model_${held}_$seed.json"
+  done
+done
+
+for kind in weak strong; do
+  record "bag_$kind" "bag_$kind" 0
+  [ -e "$OUT/diffusion_$kind" ] || $BIN/python scripts/train_seeing_policy.py --dataset="$DATA/bag_$kind" \
+    --output="$OUT/diffusion_$kind"
+done

@@ -1,0 +1,94 @@
+#!/usr/bin/env python
+"""Train a small LeRobot policy that sees by the frozen encoder, from recorded demonstrations.
+
+    scripts/train_seeing_policy.py --dataset=data/bag_weak --output=outputs/bag_diffusion_weak [--steps=8000]
+
+Encodes the demonstrations, adds each camera's view to them, trains a policy on configs/bag_diffusion.yaml, and writes
+one that makes its view itself. What is done is skipped, and a killed training goes on from its last checkpoint.
+
+It takes the steps of lerobot-train: the same configuration, policy, processors, optimiser and checkpoints. Only the
+windows come from memory: for a policy as small as this, LeRobot's loader takes most of the time.
+"""
+
+import argparse
+import subprocess
+import sys
+from pathlib import Path
+
+import draccus
+import torch
+from lerobot.common.train_utils import load_training_state, save_checkpoint, update_last_checkpoint
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.datasets.factory import resolve_delta_timestamps
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.optim.factory import make_optimizer_and_scheduler
+from lerobot.policies.factory import make_policy, make_pre_post_processors
+from tqdm import trange
+
+from lerobot_latentsafe.datasets.frame_cache import FOLDER, MANIFEST
+from lerobot_latentsafe.datasets.windows import Windows
+from lerobot_latentsafe.perceive import VIEWS, let_see, with_views
+
+CONFIG = Path(__file__).parents[1] / "configs" / "bag_diffusion.yaml"
+
+
+def train(config: TrainPipelineConfig, dataset: LeRobotDataset, output_dir: Path) -> Path:
+    """Returns the last checkpoint's policy."""
+    torch.manual_seed(config.seed)
+    config.policy.pretrained_path = None
+    policy = make_policy(config.policy, ds_meta=dataset.meta).train()
+    pipelines = make_pre_post_processors(config.policy, dataset_stats=dataset.meta.stats)
+    config.optimizer, config.scheduler = policy.config.get_optimizer_preset(), policy.config.get_scheduler_preset()
+    optimizer, scheduler = make_optimizer_and_scheduler(config, policy)
+    deltas = resolve_delta_timestamps(policy.config, dataset.meta)
+    frames = {key: [round(t * dataset.fps) for t in times] for key, times in deltas.items()}
+    windows = Windows(dataset, frames, policy.config.drop_n_last_frames)
+    last, begun = output_dir / "checkpoints" / "last", 0
+    if last.exists():
+        policy = type(policy).from_pretrained(last / "pretrained_model").train()
+        optimizer, scheduler = make_optimizer_and_scheduler(config, policy)
+        begun, optimizer, scheduler = load_training_state(last, optimizer, scheduler)
+    for step in (progress := trange(begun + 1, config.steps + 1, initial=begun, total=config.steps, unit="step")):
+        loss, _ = policy.forward(pipelines[0](windows.draw(config.batch_size)))
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(policy.parameters(), config.optimizer.grad_clip_norm)
+        optimizer.step()
+        optimizer.zero_grad(set_to_none=True)
+        scheduler.step()
+        if step % config.log_freq == 0:
+            progress.set_postfix(loss=f"{loss.item():.4f}")
+        if step % config.save_freq == 0 or step == config.steps:
+            folder = output_dir / "checkpoints" / f"{step:06d}"
+            save_checkpoint(folder, step, config, policy, optimizer, scheduler, *pipelines)
+            update_last_checkpoint(folder)
+    return last / "pretrained_model"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--dataset", type=Path, required=True, help="folder of the demonstrations")
+    parser.add_argument("--repo_id", help="of the demonstrations; by default latentsafe/<folder>")
+    parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--components", type=int, default=64, help="of each camera's view")
+    parser.add_argument("--steps", type=int)
+    parser.add_argument("--seed", type=int)
+    arguments = parser.parse_args()
+    repo_id = arguments.repo_id or f"latentsafe/{arguments.dataset.name}"
+    LeRobotDatasetMetadata(repo_id, root=arguments.dataset)  # refuse what is no dataset before any work
+    beside = {what: arguments.dataset.with_name(f"{arguments.dataset.name}_{what}") for what in ("tokens", "seen")}
+    if not (beside["tokens"] / FOLDER / MANIFEST).exists():
+        command = [Path(sys.executable).parent / "latentsafe", "cache", "--encoder=auto"]
+        command += [f"--dataset.repo_id={repo_id}", f"--dataset.root={arguments.dataset}"]
+        subprocess.run([*map(str, command), f"--output_dir={beside['tokens']}"], check=True)
+    if not (beside["seen"] / VIEWS).exists():
+        with_views(beside["tokens"], f"{repo_id}_cache", beside["seen"], arguments.components)
+    config = draccus.parse(TrainPipelineConfig, CONFIG, args=[])
+    config.steps, config.seed = arguments.steps or config.steps, arguments.seed or config.seed
+    dataset = LeRobotDataset(f"{repo_id}_cache_seen", root=beside["seen"])
+    trained = train(config, dataset, arguments.output.with_name(f"{arguments.output.name}_training"))
+    let_see(trained, beside["tokens"], beside["seen"], arguments.output)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,115 @@
+"""The scripts of the bag's experiments from end to end, on tiny stand-ins and a few steps."""
+
+import importlib.util
+import json
+import sys
+from functools import cache, partial
+from pathlib import Path
+
+import pytest
+import tiny
+import torch
+
+from lerobot_latentsafe.envs.bag import BagScene
+from lerobot_latentsafe.evaluation import bag
+from lerobot_latentsafe.evaluation.demo import Demo
+from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, STATE_NAMES, action_limits
+
+STEPS, SEEDS = 4, [bag.FIRST_SEED, bag.FIRST_SEED + 1]
+
+
+@pytest.fixture(scope="module")
+def filter_path(tmp_path_factory):
+    """A filter that never lets anything pass."""
+    return str(tiny.save_franka_filter(tmp_path_factory.mktemp("filter") / "first", scene="bag", epsilon=2.0))
+
+
+@pytest.fixture(scope="module")
+def base_path(tmp_path_factory):
+    """A diffusion policy with random weights that reads the arm's state."""
+    from lerobot.configs.types import FeatureType, PolicyFeature
+    from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
+    from lerobot.policies.factory import make_pre_post_processors
+
+    n, folder = len(STATE_NAMES), tmp_path_factory.mktemp("base") / "weak"
+    features = {
+        "observation.state": PolicyFeature(FeatureType.STATE, (n,)),
+        "observation.environment_state": PolicyFeature(FeatureType.ENV, (n,)),
+    }
+    config = tiny.diffusion_config(len(ACTION_NAMES), input_features=features)
+    low, high = (torch.tensor(limit, dtype=torch.float32) for limit in action_limits(15))
+    stats = {key: {"min": -4 * torch.ones(n), "max": 4 * torch.ones(n)} for key in features}
+    DiffusionPolicy(config).save_pretrained(folder)
+    for pipeline in make_pre_post_processors(config, dataset_stats={**stats, "action": {"min": low, "max": high}}):
+        pipeline.save_pretrained(folder)
+    return str(folder)
+
+
+@pytest.fixture
+def script(monkeypatch):
+    """A script as a module, on small pictures and for a few steps; `options` are its command line."""
+    observe = bag.observe
+
+    def observe_state(scene):
+        seen = observe(scene)
+        return {**seen, "observation.environment_state": seen["observation.state"]}
+
+    monkeypatch.setattr(bag, "STEPS", STEPS)
+    monkeypatch.setattr(bag, "observe", observe_state)
+
+    def load(name, *options):
+        spec = importlib.util.spec_from_file_location(name, Path(__file__).parents[1] / "scripts" / f"{name}.py")
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        module.BagScene = partial(BagScene, image_size=32)
+        module.scene = cache(module.BagScene)
+        monkeypatch.setattr(sys, "argv", [f"{name}.py", *options])
+        return module
+
+    return load
+
+
+def test_policies_are_compared_operators_traced_and_the_demo_tells(script, filter_path, base_path, tmp_path, capsys):
+    policies, operators = tmp_path / "policies.json", tmp_path / "operators.json"
+    options = [f"--weak={base_path}", "--filters", filter_path, "--laws", "margin", "--n=2", f"--output={policies}"]
+    script("bag_policies", *options, "--n_videos=1").main()
+    rows = json.loads(policies.read_text())
+    cell = rows["weak"]["margin"][filter_path]
+    assert rows["weak"]["bare"]["spilled"]["n"] == cell["spilled"]["n"] == 2 and rows["seeds"] == SEEDS
+    assert cell["overridden_share"] == 1.0 and cell["median_first_override"] == 0
+    assert rows["filters"] == {filter_path: {"epsilon": 2.0, "guard": 1}}
+    kept = policies.with_suffix(".jsonl").read_text()
+    script("bag_policies", *options).main()
+    assert policies.with_suffix(".jsonl").read_text() == kept  # nothing was run again
+
+    given = ["--laws", "bare", "margin", "--operators", "closed_end", "open_end", "--n=1", f"--output={operators}"]
+    script("bag_operators", f"--policy={filter_path}", *given).main()
+    traces = json.loads(operators.read_text())["closed_end margin"]["traces"]
+    assert len(traces) == 1 and len(traces[0]["value"]) == STEPS
+
+    script("demo_bag").report(tmp_path, "margin", 90.0)
+    page, numbers = (tmp_path / "report.html").read_text(), json.loads((tmp_path / "metrics.json").read_text())
+    assert page.count("<video") == 1 and page.count("<img") == 2 and "0/2 = 0.0%" in page
+    assert numbers["the same, shielded"]["overridden_share"] == 1.0 and "1.5 minutes" in capsys.readouterr().out
+
+
+def test_a_recording_is_replayed_on_every_variant(script, filter_path, tmp_path):
+    output = tmp_path / "out_of_distribution.json"
+    options = ["--filters", filter_path, "--law=margin", "--n=1", f"--output={output}"]
+    module = script("bag_out_of_distribution", *options)
+    assert module.UNSEEN == ["green", "purple", "cloth", "stiff", "heavy"]
+    module.UNSEEN = ["heavy"]
+    module.main()
+    rows = json.loads(output.read_text())
+    assert rows["red"]["bare"]["spilled"]["k"] == 0 and rows["heavy"]["pooled"]["overridden_share"] == 1.0
+    assert len(module.recording(SEEDS[0])) == STEPS and output.with_suffix(".png").exists()
+
+
+def test_a_command_that_fails_shows_the_end_of_its_log(tmp_path, capsys):
+    demo = Demo(tmp_path / "demo")
+    demo.run("greet: once", "python", "-c", "print('hello')")
+    assert (
+        "hello" in (tmp_path / "demo" / "logs" / "greet.log").read_text() and "greet: once" in capsys.readouterr().out
+    )
+    with pytest.raises(SystemExit, match=r"(?s)'break' failed.*ZeroDivisionError"):
+        demo.run("break", "python", "-c", "1 / 0")
