@@ -55,7 +55,7 @@ done.
 
 - V means nothing outside of what the data covered: other cameras, objects, dynamics, lighting. Nothing detects that.
 - It acts at the last moment and with the fallback's full action; it looks for no safe action near the proposed one.
-- Imagination is deterministic: what is random in the world is foreseen as its mean.
+- {imagination}
 - A policy under it cannot tell that a frame is late or frozen; a robot under it (`latentsafe_shielded`) can.
 """
 
@@ -133,6 +133,7 @@ def make_model_card(
             calibration=_calibration(config.calibration),
             base=f"`{config.base_policy_path}`" if config.base_policy_path else "nothing yet",
             repo_id=config.repo_id or "me/filter",
+            imagination=_imagination(config.samples),
             confusion=_confusion(config.calibration),
             evaluation=_evaluation(config.evaluation),
         )
@@ -145,6 +146,12 @@ def _world_model(config: LatentSafeConfig) -> str:
         text += f", on {perception.components} components of the frozen encoder `{perception.encoder}`"
         text += f" (weights {perception.encoder_hash}), which is not part of the checkpoint"
     return text
+
+
+def _imagination(samples: int) -> str:
+    if not samples:
+        return "Imagination is deterministic: what is random in the world is foreseen as its mean."
+    return f"Imagination draws {samples} futures and believes the worst: what it did not draw is not foreseen."
 
 
 def _calibration(evidence: dict[str, float]) -> str:

@@ -18,6 +18,7 @@ from lerobot_latentsafe.datasets.labels import FAILING, SAFE, FailureLabels
 from lerobot_latentsafe.envs.franka import FrankaScene
 from lerobot_latentsafe.envs.franka_env import FrankaEnv
 from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, STATE_NAMES, action_limits
+from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
 
 CAMERA_KEYS = ("observation.images.front", "observation.images.wrist")
 Operator = Callable[[dict[str, torch.Tensor]], np.ndarray]
@@ -142,7 +143,7 @@ def described(fps: int) -> SimpleNamespace:
         "failure": {"dtype": "int64", "shape": (1,), "names": None},
         "next.done": {"dtype": "bool", "shape": (1,), "names": None},
     }
-    return SimpleNamespace(repo_id="the replay", fps=fps, features=features)
+    return SimpleNamespace(repo_id="the replay", robot_type=LatentSafeFrankaMujoco.name, fps=fps, features=features)
 
 
 def export(replay: Replay, n_episodes: int, root: Path, repo_id: str, scene: FrankaScene) -> None:
@@ -159,9 +160,11 @@ def export(replay: Replay, n_episodes: int, root: Path, repo_id: str, scene: Fra
         raise FileExistsError(f"{root} exists; choose another --output_dir or delete it")
     begun = root.with_name(f"{root.name}.begun")
     shutil.rmtree(begun, ignore_errors=True)
+    columns = described(scene.fps)
     dataset = LeRobotDataset.create(
-        repo_id, scene.fps, described(scene.fps).features, root=begun, use_videos=False, metadata_buffer_size=100
-    )
+        repo_id, scene.fps, columns.features, root=begun, robot_type=columns.robot_type, use_videos=False,
+        metadata_buffer_size=100,
+    )  # fmt: skip
     for t in range(n_episodes * replay.length):
         state, action, failure = (replay.arrays[name][t] for name in ("state", "action", "failure"))
         dataset.add_frame(
