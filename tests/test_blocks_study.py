@@ -95,27 +95,28 @@ def test_lead_counts_from_warning_to_failure(margin, value, expected):
 
 
 @pytest.fixture
-def trained(tmp_path):
-    """A task policy, and filters of both kinds for it, of untold quality."""
-    from lerobot_latentsafe.baselines.dreamer.training import DreamerTraining
+def trained(tiny_dreamer, tmp_path):
+    """Filters of both kinds for a task policy, of untold quality."""
     from lerobot_latentsafe.training import train_reachability
 
     with tiny.short_blocks():
-        DreamerTraining(tiny.dreamer_options(tmp_path / "run", repo_id="me/blocks")).run()
-        episodes = tiny.metadata(tmp_path / "run" / "episodes", "me/blocks")
+        episodes = tiny.metadata(tiny_dreamer / "episodes", "local/blocks_dreamer")
         for target in ("reachability", "risk"):
-            train_reachability(tmp_path / "run/policy/world_model", episodes, tmp_path / target, target=target)
+            train_reachability(tiny_dreamer / "policy/world_model", episodes, tmp_path / target, target=target)
         yield tmp_path
 
 
-def test_the_table_is_written_and_goes_on_where_it_stopped(trained, monkeypatch):
+def test_the_table_is_written_and_goes_on_where_it_stopped(trained, tiny_dreamer, monkeypatch):
     cells, results = trained / "cells", trained / "results"
     arguments = [
-        str(SCRIPT), f"--dreamer={trained / 'run' / 'policy'}", "--filters", str(trained / "reachability"), "--risks",
+        str(SCRIPT), f"--dreamer={tiny_dreamer / 'policy'}", "--filters", str(trained / "reachability"), "--risks",
         str(trained / "risk"), "--n=2", "--n_curve=1", f"--cells={cells}", f"--output_dir={results}",
     ]  # fmt: skip
     monkeypatch.setattr(sys, "argv", arguments)
-    runpy.run_path(str(SCRIPT), run_name="__main__")
+    monkeypatch.setattr(SimulatorLookahead.__init__, "__defaults__", (2,))  # its horizon
+    main = runpy.run_path(str(SCRIPT))["main"]
+    main.__globals__.update(EPSILONS=(0.4,), RISK_CURVE=(0.1,))
+    main()
     table = json.loads((results / "table2.json").read_text())
     assert set(table["methods"]) == {"dreamer", "sqrl_0.1", "sqrl_0.05", "latentsafe", "lookahead"}
     for row in table["methods"].values():
@@ -124,5 +125,5 @@ def test_the_table_is_written_and_goes_on_where_it_stopped(trained, monkeypatch)
         assert sum(c["k"] for c in counts) == 2 and len(row["per_seed"]) == 1
     assert (results / "trade_off.png").exists() and len(table["curves"]) == 3
     made = {file: file.stat().st_mtime_ns for file in cells.iterdir()}
-    runpy.run_path(str(SCRIPT), run_name="__main__")
+    main()
     assert made == {file: file.stat().st_mtime_ns for file in cells.iterdir()}

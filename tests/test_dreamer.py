@@ -28,11 +28,8 @@ def short_blocks():
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    """Output folder of a run that was never interrupted."""
-    folder = tmp_path_factory.mktemp("dreamer") / "run"
-    DreamerTraining(tiny.dreamer_options(folder)).run()
-    return folder
+def trained(tiny_dreamer):
+    return tiny_dreamer
 
 
 @pytest.fixture

@@ -251,7 +251,8 @@ def dreamer_options(output_dir, **changes):
         kept_commands=["gripper.pos"], margin_layers=3,
     )  # fmt: skip
     policy = LatentSafeDreamerConfig(behavior=behavior, device="cpu", push_to_hub=False)
-    sizes = dict(
-        demonstrations=2, pretraining=3, steps=7, collect_every=2, n_envs=2, batch_size=4, save_every=2, log_every=1
-    )
-    return TrainDreamer(output_dir=output_dir, policy=policy, model=model, **{**sizes, **changes})
+    options = dict(
+        policy=policy, model=model, demonstrations=2, pretraining=3, steps=7, collect_every=2, n_envs=2, batch_size=4,
+        save_every=2, log_every=1,
+    )  # fmt: skip
+    return TrainDreamer(output_dir=output_dir, **{**options, **changes})
