@@ -71,16 +71,6 @@ def test_a_block_that_is_bound_to_fall_is_foreseen(scene):
     assert SimulatorLookahead(scene, horizon=40)._outcome(scene.get_state(), STILL) < 0
 
 
-def test_it_keeps_a_careless_operator_from_failing(scene):
-    seed = next(s for s in range(20) if _fails(scene, s, None))
-    assert not _fails(scene, seed, SimulatorLookahead(scene, horizon=10))
-
-
-def _fails(scene, seed, filter):
-    steps(scene, 42, filter, seed=seed)
-    return scene.truth()["failure"]
-
-
 @pytest.mark.parametrize(
     "margin, value, expected",
     [
