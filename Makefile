@@ -9,8 +9,9 @@ setup:
 demo: setup
 	$(PYTHON) scripts/demo.py
 
+# make demo-bag POLICY=<filter> BASE=<policy to be shielded>
 demo-bag: setup
-	MUJOCO_GL=$${MUJOCO_GL:-egl} $(PYTHON) scripts/demo_bag.py
+	MUJOCO_GL=$${MUJOCO_GL:-egl} $(PYTHON) scripts/demo_bag.py --policy="$(POLICY)" --base="$(BASE)"
 
 test: lint
 	HF_HUB_OFFLINE=1 $(PYTHON) -m pytest

@@ -33,6 +33,13 @@ class DatasetSource:
 
 
 @dataclass
+class OptionalDatasetSource(DatasetSource):
+    """A LeRobotDataset, or none."""
+
+    repo_id: str | None = None
+
+
+@dataclass
 class PolicySource:
     """A checkpoint: a folder, a Hub id, or the name of a committed one (see `latentsafe path`)."""
 
@@ -267,10 +274,7 @@ class Wrap:
 
         refuse_existing(self.output_dir)
         policy = LatentSafePolicy.from_pretrained(self.policy.path)
-        for name in ("epsilon", "guard", "law", "mode"):
-            if getattr(self, name) is not None:
-                setattr(policy.config, name, getattr(self, name))
-        policy.config.__post_init__()
+        policy.config.override(self, "epsilon", "guard", "law", "mode")
         if self.base_policy_path:
             policy.attach(self.base_policy_path)
         save_filter(policy, self.output_dir, half=self.half)
@@ -386,10 +390,7 @@ class EvalShield:
         if self.n_episodes < 1:
             raise ValueError(f"--n_episodes is {self.n_episodes}; expected at least 1")
         policy = LatentSafePolicy.from_pretrained(self.policy.path)
-        for name in ("epsilon", "guard", "law"):
-            if getattr(self, name) is not None:
-                setattr(policy.config, name, getattr(self, name))
-        policy.config.__post_init__()
+        policy.config.override(self, "epsilon", "guard", "law")
         if self.base_policy_path:
             policy.attach(self.base_policy_path)
         result = compare(policy, self.env, self.n_episodes, self.seed, self.n_videos if self.video else 0)
@@ -566,29 +567,41 @@ class WriteLabels:
 
 @dataclass
 class Report:
-    """Write one HTML file about a filter and, with a base policy, about what it changes: opens from disk, prints."""
+    """Write one HTML file about a filter: opens from disk, prints.
 
-    env: EnvConfig
+    With --env.type and a base policy, about what it changes: the policy is run bare and shielded from the same starts.
+    With --dataset.repo_id, about what `latentsafe record` stored under it. What the filter imagined when it acted is
+    shown, too; for a world model that cannot draw (gru, dino_wm), as the most similar frames of these episodes and of
+    the dataset, which may be any of the same robot.
+    """
+
     policy: PolicySource = field(default_factory=PolicySource)
+    env: EnvConfig | None = None
     base_policy_path: str | None = None
+    dataset: OptionalDatasetSource = field(default_factory=OptionalDatasetSource)
     output: Path = Path("outputs/report.html")
     n_episodes: int = 50
     seed: int = 0
     epsilon: float | None = None
-    """Overrides the filter's."""
+    guard: int | None = None
+    law: str | None = None
+    """These override the filter's."""
 
     def run(self) -> None:
         from lerobot_latentsafe.evaluation.filter_report import write_filter_report
+        from lerobot_latentsafe.labeling.frames import DatasetFrames
         from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 
         if self.n_episodes < 1:
             raise ValueError(f"--n_episodes is {self.n_episodes}; expected at least 1")
-        policy = LatentSafePolicy.from_pretrained(self.policy.path)
-        if self.epsilon is not None:
-            policy.config.epsilon = self.epsilon
+        if self.base_policy_path and self.env is None:
+            raise ValueError("--base_policy_path runs a policy, but where? Give --env.type")
+        policy = LatentSafePolicy.from_pretrained(self.policy.path).eval()
+        policy.config.override(self, "epsilon", "guard", "law")
         if self.base_policy_path:
             policy.attach(self.base_policy_path)
-        write_filter_report(self.output, policy, self.env, self.n_episodes, self.seed)
+        recorded = DatasetFrames(self.dataset.downloaded()) if self.dataset.repo_id else None
+        write_filter_report(self.output, policy, self.env, self.n_episodes, self.seed, recorded)
         print(f"open {self.output}")
 
 

@@ -157,6 +157,17 @@ class LatentSafeConfig(PreTrainedConfig):
                 f"--policy.lookahead is {self.lookahead}; a risk is read at the next latent: expected 0 with law 'risk'"
             )
 
+    def override(self, options: object, *names: str) -> None:
+        """Take over those of these options that are given, as attributes that are not None.
+
+        Raises:
+            ValueError: what results is no configuration.
+        """
+        for name in names:
+            if getattr(options, name) is not None:
+                setattr(self, name, getattr(options, name))
+        self.__post_init__()
+
     @property
     def observation_delta_indices(self) -> list[int] | None:
         """Frames t .. t + T - 1; with a frame cache the policy cuts the window itself, from `index`."""

@@ -47,7 +47,9 @@ KEY_S, POINT_S, DECIDE_S = 0.20, 1.10, 1.35
 # -- a dataset whose failures are known ---
 
 
-def film(root: Path, n_episodes: int, size: int = 256, repo_id: str = "bench/cup", seed: int = 0) -> list[int]:
+def film(
+    root: Path, n_episodes: int, size: int = 256, repo_id: str = "bench/cup", seed: int = 0, cameras=CAMERAS
+) -> list[int]:
     """Record a cup that is pushed along a table and, in two of three episodes, over its edge.
 
     Returns:
@@ -60,7 +62,7 @@ def film(root: Path, n_episodes: int, size: int = 256, repo_id: str = "bench/cup
     features = {key: {"dtype": "float32", "shape": (len(n),), "names": n} for key, n in names.items()}
     shape = {"dtype": "video", "shape": (size, size, 3), "names": ["height", "width", "channels"]}
     dataset = LeRobotDataset.create(
-        repo_id, FPS, {**features, **dict.fromkeys(CAMERAS, shape)}, root=root, robot_type="bench",
+        repo_id, FPS, {**features, **dict.fromkeys(cameras, shape)}, root=root, robot_type="bench",
         streaming_encoding=True, metadata_buffer_size=100, video_files_size_in_mb=5,
         rgb_encoder=RGBEncoderConfig(vcodec="h264", preset="ultrafast"),
     )  # fmt: skip
@@ -71,7 +73,7 @@ def film(root: Path, n_episodes: int, size: int = 256, repo_id: str = "bench/cup
         fallen = push > 0.75
         first.append(int(fallen.argmax()) if fallen.any() else length)
         for t in range(length):
-            images = {camera: draw(push[t], t - first[-1], size, camera == CAMERAS[1]) for camera in CAMERAS}
+            images = {camera: draw(push[t], t - first[-1], size, camera == CAMERAS[1]) for camera in cameras}
             state, action = np.array([push[t]], np.float32), np.array([push[min(t + 1, length - 1)], 0], np.float32)
             dataset.add_frame({**images, "observation.state": state, "action": action, "task": "push the cup"})
         dataset.save_episode()

@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""The committed filter of the bag at work: a diffusion policy and operators, bare and shielded from the same starts.
+"""A filter of the bag at work: a diffusion policy and operators, bare and shielded from the same starts.
 
 Nothing is trained. Runs scripts/bag_policies.py and scripts/bag_operators.py, small enough for two cores, and writes
 outputs/demo_bag/report.html and outputs/demo_bag/metrics.json. Numbers of full size are in results/bag.
@@ -112,8 +112,8 @@ def main() -> None:
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("outputs/demo_bag"))
-    parser.add_argument("--policy", default="bag", help="the filter: a folder, a Hub id or a committed name")
-    parser.add_argument("--base", default="bag_diffusion_weak", help="the policy to be shielded, likewise")
+    parser.add_argument("--policy", required=True, help="the filter: a folder, a Hub id or a committed name")
+    parser.add_argument("--base", required=True, help="the policy to be shielded, likewise")
     parser.add_argument("--n", type=int, default=20, help="starts of the policy; operators get half as many")
     arguments = parser.parse_args()
     law = PreTrainedConfig.from_pretrained(resolve_checkpoint(arguments.policy)).law

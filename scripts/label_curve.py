@@ -1,96 +1,135 @@
 #!/usr/bin/env python
 """How good the failure margin gets with few labels: episodes labelled at random, or in the order the page suggests.
 
-    scripts/label_curve.py --policy=<world model> --root=data/car_cache
+    scripts/label_curve.py --policy=<world model> --repo_id=latentsafe/dubins_random_cache --root=data/car_cache
+    scripts/label_curve.py --policy=<world model> --repo_id=latentsafe/bag_cache --root=data/bag_tokens \\
+        --output=results/labels/curve_bag.json
 
-Fits fresh margins on the frozen features of a world model. For a clean result train that with --policy.margin_weight=0,
-so that no label has shaped its features; the JSON says whether it was. Labels come from the dataset's own column; the
-last fifth of the episodes is held out, and scored frame by frame.
+Fits fresh margins to the frozen features of a world model, as `latentsafe train-margin` does. In suggested order a
+person labels in rounds, each with suggestions of the margin fitted to the labels of the rounds before. For a clean
+result train the world model with --policy.margin_weight=0, so that no label has shaped its features; the JSON says
+whether it was. Labels come from the dataset's own column; a fifth of the episodes is held out and scored frame by
+frame. All curves of the output's folder are drawn into curve.png beside them.
 """
 
 import argparse
+import dataclasses
+import json
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
 from lerobot_latentsafe.datasets.clips import ClipReader
-from lerobot_latentsafe.datasets.labels import SAFE
-from lerobot_latentsafe.evaluation.rollouts import confusion, provenance, write_json
+from lerobot_latentsafe.evaluation.figures import save
+from lerobot_latentsafe.evaluation.rollouts import provenance, write_json
+from lerobot_latentsafe.evaluation.world_model import balanced_accuracy
 from lerobot_latentsafe.labeling.suggestions import Suggestion
-from lerobot_latentsafe.margin import FailureMargin, hinge_loss
+from lerobot_latentsafe.margin import FailureMargin
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
-from lerobot_latentsafe.training import load_with_cache
+from lerobot_latentsafe.training import fit_margin, load_with_cache, seen_and_imagined
 
-SHARES = (0.01, 0.02, 0.05, 0.1, 0.2, 1.0)
-ORDERS = {
-    "random": None,
-    "suggested": lambda margin: Suggestion.of(margin).usefulness,
-    "uncertain": lambda margin: -np.sort(np.abs(margin))[:5].mean(),
-}
-"""What is labelled next: the episodes of the highest score under the margin trained so far."""
+SHARES = (0.02, 0.05, 0.1, 0.2, 1.0)
+"""The rounds of labelling: share of the episodes that are labelled after each."""
+BLOCK = 10
+"""Every fifth block of so many episodes is held out: what was recorded together, such as branches, stays together."""
+
+
+class Study:
+    """Features of a labelled dataset under a frozen world model: as if any share of the episodes had been labelled.
+
+    Attributes:
+        seen: (N, D) of every frame, filtered from the first frame of its episode: what is asked about.
+        features, frame: (M, D) seen and imagined ones of random windows, (M,) their frames: what is fitted to.
+        failure, episode: (N,) of every frame.
+        first: frame at which each episode begins.
+        pool: episodes that may be labelled.
+        held_out: bool (N,), frames of the other episodes.
+
+    Raises:
+        ValueError: a frame without a label.
+    """
+
+    def __init__(self, policy: LatentSafePolicy, reader: ClipReader):
+        self.config, labels = policy.config, reader.labels
+        self.failure, self.episode = labels.failure, labels.episode
+        if (self.failure < 0).any():
+            raise ValueError(f"{(self.failure < 0).sum()} frames have no label; this study needs a dataset with all")
+        self.first = np.unique(self.episode, return_index=True)[1]
+        episodes = np.arange(len(self.first))
+        self.pool = episodes[episodes // BLOCK % 5 < 4]
+        self.held_out = ~np.isin(self.episode, self.pool)
+        self.seen = encode(policy, reader, self.first)
+        # A frame's number stands in for its label, so that labels can be put on and taken off later.
+        numbered = dataclasses.replace(labels, failure=np.arange(len(self.failure)))
+        numbers = ClipReader(numbered, reader.cache, reader.length)
+        generator = torch.Generator().manual_seed(0)
+        self.features, self.frame = seen_and_imagined(policy, numbers, self.config.margin_clips, generator)
+
+    def fit(self, labelled: np.ndarray, seed: int) -> np.ndarray:
+        """Bounded margin (N,) of every frame, after labelling some episodes."""
+        torch.manual_seed(seed)
+        generator = torch.Generator().manual_seed(seed)
+        margin = FailureMargin(self.seen.shape[1], self.config.margin_hidden, self.config.margin_layers)
+        known = torch.from_numpy(np.isin(self.episode, labelled))[self.frame]
+        failure = torch.from_numpy(self.failure)[self.frame[known]]
+        fit_margin(margin, self.features[known], failure, self.config.margin_delta, generator)
+        with torch.no_grad():
+            return margin.bounded(self.seen).numpy()
+
+    def curve(self, suggested: bool, seed: int) -> dict[str, float]:
+        """Balanced accuracy on held-out frames after each round; what is labelled first is random either way."""
+        order, margin, scores = np.random.default_rng(seed).permutation(self.pool), None, {}
+        labelled = 0
+        for share in SHARES:
+            if suggested and margin is not None:
+                useful = [Suggestion.of(l).usefulness for l in np.split(margin, self.first[1:])]
+                order[labelled:] = sorted(order[labelled:], key=lambda episode: -useful[episode])
+            labelled = max(1, round(share * len(order)))
+            margin = self.fit(order[:labelled], seed)
+            scores[f"{share:g}"] = balanced_accuracy(margin[self.held_out] < 0, self.failure[self.held_out])
+        return scores
 
 
 @torch.no_grad()
-def encode(policy: LatentSafePolicy, reader: ClipReader, length: int) -> torch.Tensor:
-    """Features (N, D) of every frame, filtered from the first frame of its episode (at most `length`)."""
-    reader.length = length
-    start = np.flatnonzero(np.r_[True, np.diff(reader.labels.episode) > 0])
-    features = torch.zeros(len(reader.labels.failure), policy.world_model.feature_dim)
-    for chunk in np.array_split(start, max(1, len(start) // 64)):
-        clip = reader.cut(chunk, policy)
+def encode(policy: LatentSafePolicy, reader: ClipReader, first: np.ndarray) -> torch.Tensor:
+    """Features (N, D) of every frame of the episodes that begin at these frames, filtered from there."""
+    n, longest = len(reader.labels.episode), int(np.bincount(reader.labels.episode).max())
+    features = torch.zeros(n, policy.world_model.feature_dim)
+    for chunk in np.array_split(first, -(-len(first) // 64)):
+        clip = reader.cut(chunk, policy, length=longest)
+        index = torch.from_numpy(chunk)[:, None] + torch.arange(longest)
         z = policy.world_model.features(policy.world_model.encode(clip))
-        index = torch.from_numpy(chunk)[:, None] + torch.arange(length)
-        features[index[clip.valid]] = z[clip.valid]
+        features[index[clip.valid.cpu()]] = z[clip.valid].cpu()
     return features
 
 
-def fit(
-    features: torch.Tensor, failure: torch.Tensor, policy: LatentSafePolicy, seed: int, steps: int
-) -> FailureMargin:
-    """A fresh margin on labelled frames, balanced batches of 512."""
-    torch.manual_seed(seed)
-    config = policy.config
-    margin = FailureMargin(features.shape[1], config.margin_hidden, config.margin_layers)
-    optimizer = torch.optim.AdamW(margin.parameters(), 3e-3, weight_decay=1e-3)
-    classes = [torch.nonzero(failure == value)[:, 0] for value in (0, 1)]
-    for _ in range(steps):
-        picked = torch.cat([c[torch.randint(len(c), (256,))] for c in classes if len(c)])
-        loss = hinge_loss(margin(features[picked]), failure[picked], config.margin_delta)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-    return margin
-
-
-def curve(order: str, seed: int, data: dict, policy: LatentSafePolicy, steps: int) -> dict[str, float]:
-    """Balanced accuracy on held-out frames after each share of labels."""
-    rng, score = np.random.default_rng(seed), ORDERS[order]
-    features, failure, episode = data["features"], data["failure"], data["episode"]
-    pool, scores = data["pool"], {}
-    labelled: list[int] = []
-    for share in SHARES:
-        rest = rng.permutation(np.setdiff1d(pool, labelled))
-        if score is not None and labelled:
-            with torch.no_grad():
-                l = margin.bounded(features).numpy()  # noqa: F821 (fitted on the smaller share)
-            rest = np.array(sorted(rest, key=lambda e: -score(l[data["frames"][e]])))
-        labelled += rest[: round(share * len(pool)) - len(labelled)].tolist()
-        known = torch.from_numpy(np.isin(episode, labelled))
-        margin = fit(features[known], failure[known], policy, seed, steps)
-        with torch.no_grad():
-            safe = (margin(features[data["held_out"]]) >= 0).numpy()
-        scores[f"{share:g}"] = confusion(safe, failure[data["held_out"]].numpy() == SAFE)["balanced_accuracy"]
-    return scores
+def draw(files: list[Path]) -> plt.Figure:
+    """One panel a dataset: mean over seeds, lowest to highest shaded, and what all labels give."""
+    figure, axes = plt.subplots(1, len(files), figsize=(5.2 * len(files), 3.8), squeeze=False)
+    for ax, file in zip(axes[0], files):
+        row = json.loads(file.read_text())
+        for order, colour in (("random", "tab:gray"), ("suggested", "tab:blue")):
+            curves = np.array([list(curve.values()) for curve in row["balanced_accuracy"][order]])
+            ax.plot(SHARES, curves.mean(0), "o-", color=colour, label=f"{order} order")
+            ax.fill_between(SHARES, curves.min(0), curves.max(0), color=colour, alpha=0.2)
+        ax.axhline(curves[:, -1].mean(), color="k", lw=0.8, ls="--", label="all labels")
+        ax.set(xscale="log", xticks=SHARES, xticklabels=[f"{share:.0%}" for share in SHARES])
+        ax.minorticks_off()
+        ax.set(title=f"{file.stem.removeprefix('curve_')}, {row['episodes']} episodes", xlabel="episodes labelled")
+        ax.set_ylabel("balanced accuracy, held-out frames")
+        ax.legend(loc="lower right")
+    figure.tight_layout()
+    return figure
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--policy", default="dubins")
-    parser.add_argument("--repo_id", default="me/car_cache")
+    parser.add_argument("--policy", required=True)
+    parser.add_argument("--repo_id", required=True)
     parser.add_argument("--root", required=True)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--steps", type=int, default=1500)
     parser.add_argument("--output", type=Path, default=Path("results/labels/curve_dubins.json"))
     arguments = parser.parse_args()
     torch.set_num_threads(1)
@@ -99,29 +138,22 @@ def main() -> None:
 
     meta = LeRobotDatasetMetadata(arguments.repo_id, root=arguments.root)
     policy, reader = load_with_cache(arguments.policy, meta)
-    episode = reader.labels.episode
-    n, longest = episode.max() + 1, int(np.bincount(episode).max())
-    features = encode(policy, reader, longest)
-    pool = np.arange(int(0.8 * n))
-    data = {
-        "features": (features - features.mean(0)) / features.std(0).clamp_min(1e-3),
-        "failure": torch.from_numpy(reader.labels.failure.astype(np.int64)),
-        "episode": episode,
-        "pool": pool,
-        "frames": {e: np.flatnonzero(episode == e) for e in pool},
-        "held_out": torch.from_numpy(episode >= len(pool)),
+    study = Study(policy, reader)
+    curves = {
+        order: [study.curve(order == "suggested", seed) for seed in arguments.seeds]
+        for order in ("random", "suggested")
     }
-    curves = {order: [curve(order, s, data, policy, arguments.steps) for s in arguments.seeds] for order in ORDERS}
     for order, rows in curves.items():
-        print(order, {share: f"{np.mean([r[share] for r in rows]):.4f}" for share in rows[0]})
+        print(order, {share: f"{np.mean([row[share] for row in rows]):.4f}" for share in rows[0]})
     row = {
         "balanced_accuracy": curves,
-        "world_model": arguments.policy,
+        "lost_with_a_tenth": {o: float(np.mean([r["1"] - r["0.1"] for r in rows])) for o, rows in curves.items()},
         "labels_shaped_the_features": policy.config.margin_weight > 0,
-        "episodes": len(pool),
+        "episodes": len(study.pool),
         **provenance(arguments.seeds),
     }
     write_json(arguments.output, row)
+    save(draw(sorted(arguments.output.parent.glob("curve_*.json"))), arguments.output.with_name("curve.png"))
 
 
 if __name__ == "__main__":

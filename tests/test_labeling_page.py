@@ -51,10 +51,10 @@ class Server:
 
 @pytest.fixture(scope="module")
 def filmed(tmp_path_factory):
-    """12 episodes of two small cameras."""
+    """12 episodes of three small cameras."""
     root = tmp_path_factory.mktemp("filmed") / "cup"
-    film = runpy.run_path(str(Path(__file__).parents[1] / "scripts" / "bench_labeling.py"))["film"]
-    film(root, 12, size=64, repo_id=tiny.REPO_ID)
+    bench = runpy.run_path(str(Path(__file__).parents[1] / "scripts" / "bench_labeling.py"))
+    bench["film"](root, 12, size=64, repo_id=tiny.REPO_ID, cameras=(*bench["CAMERAS"], "observation.images.side"))
     return root
 
 
@@ -133,6 +133,20 @@ def test_ten_episodes_by_keyboard_reload_and_undo(server, browser):
         assert verdicts(server, "dropped") == [None] * 12
 
 
+PICTURES_AGREE = """([episode, index]) => Promise.all([...document.querySelectorAll('#cameras canvas')].map(
+  async (canvas, camera) => {
+    const content = await (await fetch(`api/frames/${camera}/${episode}`)).arrayBuffer();
+    const sizes = new Uint32Array(content, 4, new DataView(content).getUint32(0, true));
+    const at = 4 * (sizes.length + 1) + sizes.slice(0, index).reduce((a, b) => a + b, 0);
+    const image = await createImageBitmap(new Blob([content.slice(at, at + sizes[index])]));
+    const stored = new OffscreenCanvas(image.width, image.height);
+    stored.getContext('2d').drawImage(image, 0, 0);
+    const pixels = c => c.getContext('2d').getImageData(0, 0, c.width, c.height).data.join();
+    return pixels(canvas) === pixels(stored);
+  }))"""
+"""Whether each camera's canvas shows the stored picture of this frame."""
+
+
 def test_cameras_stay_in_step_while_moving(server, browser):
     with opened(browser, server.address) as page:
         shown(page)
@@ -142,6 +156,7 @@ def test_cameras_stay_in_step_while_moving(server, browser):
         page.keyboard.press("Shift+ArrowRight")
         page.wait_for_function("() => view.dataset.shown?.endsWith(':25')")
         assert "frame 25 of" in page.inner_text("#frame")
+        assert page.evaluate(PICTURES_AGREE, [shown(page), 25]) == [True] * 3
         box = page.locator("#timeline").bounding_box()
         page.mouse.click(box["x"] + 1, box["y"] + 10)
         page.wait_for_function("() => view.dataset.shown?.endsWith(':0')")

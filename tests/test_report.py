@@ -2,9 +2,15 @@ import re
 
 import numpy as np
 import pytest
+import tiny
+import torch
 
+from lerobot_latentsafe import LatentSafeBagEnv, LatentSafeBlocksEnv
 from lerobot_latentsafe.cli import main
 from lerobot_latentsafe.evaluation import report
+from lerobot_latentsafe.evaluation.filter_report import write_filter_report
+from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+from lerobot_latentsafe.shield import BasePolicy
 
 
 @pytest.fixture(scope="module")
@@ -28,6 +34,48 @@ def test_report_shows_rates_curves_and_imagination(page):
     assert "not a certified safety device" in page
 
 
+class Still(BasePolicy):
+    """A base policy that does not move, with the gripper open."""
+
+    def __init__(self):
+        pass
+
+    def reset(self):
+        pass
+
+    replan = reset
+
+    def propose(self, observation):
+        action = torch.zeros(len(observation["observation.state"]), 7)
+        action[:, -1] = 1.0
+        return action
+
+
+def franka_page(tmp_path, env, **changes):
+    """The report on a filter of the simulated Franka that always acts, in two episodes."""
+    trained = tiny.save_franka_filter(tmp_path / "filter", scene=env.scene, epsilon=2.0, **changes)
+    policy = LatentSafePolicy.from_pretrained(trained).eval()
+    if perception := getattr(policy.world_model, "perception", None):
+        perception.basis.axes.normal_(std=0.01)
+        perception.basis.fitted.fill_(True)
+    policy._base = [Still()]
+    write_filter_report(tmp_path / "report.html", policy, env, 2, 0, None)
+    return (tmp_path / "report.html").read_text()
+
+
+def test_report_on_the_bag_shows_nearest_frames_and_severity(tmp_path):
+    page = franka_page(tmp_path, LatentSafeBagEnv(image_size=32, episode_length=4), world_model=tiny.gru_config())
+    assert page.count("cannot draw") == 2 and "of the 16 it has seen here" in page  # two episodes, bare and shielded
+    assert page.count("imagined failure") == 4
+    assert "How much was spilled" in page and page.count("0/2 = 0.0%") >= 8
+    assert "safe set" not in page
+
+
+def test_report_on_the_blocks_draws_what_was_imagined(tmp_path):
+    page = franka_page(tmp_path, LatentSafeBlocksEnv(image_size=32, episode_length=4))
+    assert page.count("imagined failure") == 4 and "cannot draw" not in page and "spilled" not in page
+
+
 def test_text_is_escaped():
     assert "<b>" not in report.heading("<b>") + report.table(["<b>"], [["<b>"]]) + report.chart({"<b>": np.ones(3)}, 10)
 
@@ -41,6 +89,11 @@ def test_report_without_a_base_policy_is_about_the_filter_alone(tiny_filter, tmp
     path = tmp_path / "report.html"
     main(["report", f"--policy.path={tiny_filter}", "--env.type=latentsafe_dubins", f"--output={path}"])
     assert "The safe set" in path.read_text() and "<video" not in path.read_text()
+
+
+def test_policy_without_a_place_to_run_it_is_a_message(tiny_filter, tiny_diffusion):
+    with pytest.raises(SystemExit, match=r"Give --env.type"):
+        main(["report", f"--policy.path={tiny_filter}", f"--base_policy_path={tiny_diffusion}"])
 
 
 def test_no_episodes_is_a_message(tiny_filter, capsys):

@@ -1,7 +1,9 @@
 """Any robot behind a filter: what is sent is judged, and nothing unjudged moves it."""
 
 import logging
+import sys
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -47,10 +49,13 @@ def test_it_is_the_inner_robot_to_lerobot(robot):
     assert robot.name == robot.robot_type == "latentsafe_franka_mujoco"
     assert robot.action_features == robot.inner.action_features
     assert set(robot.cameras) == {"front", "wrist"} and robot.is_connected and robot.is_calibrated
+    decided = {"shield.value", "shield.margin", "shield.intervened"}
     seen = robot.get_observation()
-    assert set(robot.observation_features) == set(seen)
+    assert set(seen) == {*robot.observation_features, *decided} and seen["shield.intervened"] == 0.0
+    assert np.isnan([seen["shield.value"], seen["shield.margin"]]).all()
     robot.send_action(STILL)
-    assert set(robot.get_observation()) - set(seen) == {"shield.value", "shield.margin", "shield.intervened"}
+    seen = robot.get_observation()
+    assert np.isfinite([seen[name] for name in decided]).all()
 
 
 def test_a_safe_action_is_executed_as_it_is(robot):
@@ -322,6 +327,12 @@ def test_a_recording_stores_what_was_executed(tmp_path, epsilon, capsys):
     merged = LeRobotDataset("me/merged", root=tmp_path / "merged")
     assert np.allclose(np.array(merged.hf_dataset["shield.proposed"]), proposed, atol=1e-6)
     assert len(merged) == len(rows) and "shield.reason" in merged.features
+    page = tmp_path / "report.html"
+    shown = ["--dataset.repo_id=me/shielded", f"--dataset.root={root}", f"--output={page}"]
+    cli.main(["report", f"--policy.path={trained}", *shown])
+    assert f"{100.0 * (epsilon == ALWAYS):.1f}% of all steps" in page.read_text()
+    assert page.read_text().count("<video") == dataset.num_episodes
+    assert ("imagined failure" in page.read_text()) == (epsilon == ALWAYS)
 
 
 def test_lerobots_own_commands_take_the_shielded_robot(trained, tmp_path, monkeypatch):
@@ -474,18 +485,38 @@ def test_a_rollout_is_shielded_once(trained, monkeypatch, executed, epsilon, onc
     assert returning and all(sent[name] == 0.0 for sent in returning for name in ACTION_NAMES[:6])
 
 
-def test_live_values_are_displayed(trained, monkeypatch):
-    """What LeRobot hands to its viewer, which need not be installed here."""
-    from lerobot.scripts import lerobot_teleoperate
+@pytest.fixture
+def viewer(monkeypatch):
+    """A stand-in for rerun, which need not be installed here: `logged` pairs of path and value, `layouts` sent."""
+    from lerobot.utils import import_utils
 
-    seen = []
-    monkeypatch.setattr(lerobot_teleoperate, "init_visualization", lambda *a, **k: None)
-    monkeypatch.setattr(lerobot_teleoperate, "shutdown_visualization", lambda *a, **k: None)
-    monkeypatch.setattr(
-        lerobot_teleoperate, "log_visualization_data", lambda *a, observation, **k: seen.append(observation)
+    logged, layouts, ignore = [], [], lambda *a, **k: None
+    view = lambda **options: options  # noqa: E731
+    blueprint = SimpleNamespace(
+        Spatial2DView=view, TimeSeriesView=view, Grid=lambda *views: views, Blueprint=lambda grid: grid
     )
+    rerun = SimpleNamespace(
+        init=ignore, spawn=ignore, rerun_shutdown=ignore, Scalars=float, Image=np.shape, blueprint=blueprint,
+        log=lambda path, entity, **k: logged.append((path, entity)), send_blueprint=layouts.append,
+    )  # fmt: skip
+    monkeypatch.setitem(sys.modules, "rerun", rerun)
+    monkeypatch.setitem(sys.modules, "rerun.blueprint", blueprint)
+    monkeypatch.setitem(import_utils._require_package_cache, "rerun", True)
+    monkeypatch.setenv("RERUN_FLUSH_NUM_BYTES", "8000")  # LeRobot sets it for good
+    return SimpleNamespace(logged=logged, layouts=layouts)
+
+
+def test_live_values_are_displayed(trained, viewer):
+    """LeRobot lays the viewer out by the first tick's observation: what is missing then is never shown."""
     cli.main(["teleoperate", *shielded_options(trained, **OPERATOR, display_data="true")])
-    assert all(np.isfinite(o["shield.value"]) and o["shield.intervened"] == 1.0 for o in seen[1:]) and len(seen) > 2
+    (layout,) = viewer.layouts
+    (curves,) = [view["contents"] for view in layout if view["name"] == "observation"]
+    for name in ("value", "margin", "intervened"):
+        path = f"observation.shield.{name}"
+        values = [value for logged, value in viewer.logged if logged == path]
+        assert path in curves and len(values) > 2 and np.isfinite(values[1:]).all()
+    assert set(values[1:]) == {1.0}
+    assert {"observation.front", "observation.wrist"} <= {view["name"] for view in layout}
 
 
 def test_what_the_robot_clips_is_stored_clipped_and_sent_once(robot, monkeypatch):

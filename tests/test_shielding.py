@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -106,6 +107,7 @@ def test_outcomes_by_hand():
         steps=np.array([10, 10, 10, 10]),
         overridden=np.array([0, 4, 0, 0]),
         action_change=np.array([0.0, 2.0, 0.0, 0.0]),
+        severity=np.array([0.0, 0.5, 0.0, 0.0]),
     )
     rates = episodes.rates()
     assert [rates[k]["k"] for k in ("success", "violation", "incompletion")] == [1, 1, 2]
@@ -151,8 +153,10 @@ def test_figures_and_videos_are_written(result, tmp_path):
 
     episodes = result["episodes"]
     figures.save(figures.trajectories(episodes), tmp_path / "new" / "trajectories.png")
+    spilled = {"bare": replace(episodes["bare"], severity=np.array([0.0, 0.04, 0.5, 1.0]))}
+    figures.save(figures.severities(spilled), tmp_path / "severities.png")
     figures.save(figures.value_trace(episodes["shielded"].traces[0], 0.0), tmp_path / "trace.png")
     videos = figures.write_videos(episodes, tmp_path / "videos")
     assert len(videos) == 2
-    for file in (tmp_path / "new" / "trajectories.png", tmp_path / "trace.png", *videos):
+    for file in (tmp_path / "new" / "trajectories.png", tmp_path / "severities.png", tmp_path / "trace.png", *videos):
         assert file.stat().st_size > 1000

@@ -34,6 +34,8 @@ class Source:
             smaller ones keep the proportions. Episodes of different behaviours are interleaved.
         branches: episodes that start from each grasped state; 0 records whole episodes from the start.
         grasps: of those states, the shares in which the bag is held by its closed end, middle and open end.
+        astray: share of episodes that start with the arm astray above the bag instead of at home: demonstrations that
+            all go straight to the bag never show a policy how to correct itself.
     """
 
     scene: str
@@ -41,6 +43,7 @@ class Source:
     variant: str | None = None
     branches: int = 0
     grasps: tuple[float, float, float] = (0.6, 0.2, 0.2)
+    astray: float = 0.0
 
     @property
     def n_episodes(self) -> int:
@@ -57,8 +60,8 @@ SOURCES: dict[str, Source] = {
     "bag_branches": Source("bag", {"branch": 500}, branches=5),
     "bag_climbs": Source("bag", {"climb": 200}, branches=4, grasps=(0.5, 0.1, 0.4)),
     "bag_lifts": Source("bag", {"rise": 200}, branches=1, grasps=(0.5, 0.0, 0.5)),
-    "bag_strong": Source("bag", {"middle": 100}),
-    "bag_weak": Source("bag", {"closed_end": 100}, variant="sealed"),
+    "bag_strong": Source("bag", {"middle": 100}, astray=0.7),
+    "bag_weak": Source("bag", {"closed_end": 100}, variant="sealed", astray=0.7),
     "blocks_demos": Source("blocks", {"pluck_careful": 120, "pluck_careless": 80}),
     "blocks_random": Source("blocks", {"random": 200}),
 }
@@ -153,6 +156,7 @@ def _record_part(source: Source, repo_id: str, root: Path, episodes: range, seed
 
 def episode_frames(robot: "LatentSafeFrankaMujoco", source: Source, episode: int, seed: int) -> Iterator[dict]:
     """The frames of an episode as `LeRobotDataset.add_frame` takes them; the first failing frame and all after fail."""
+    from lerobot_latentsafe.teleoperators.scripted.behaviors import stray
     from lerobot_latentsafe.teleoperators.scripted.config_scripted import LatentSafeScriptedConfig
     from lerobot_latentsafe.teleoperators.scripted.scripted import LatentSafeScripted
 
@@ -162,6 +166,9 @@ def episode_frames(robot: "LatentSafeFrankaMujoco", source: Source, episode: int
     n_frames = round(info.episode_seconds * info.fps)
     if source.branches:
         n_frames -= _grasp(robot, _scene_seed(seed, start), source.grasps)
+    rng = np.random.default_rng([8, _scene_seed(seed, start)])
+    if rng.random() < source.astray:
+        _go(robot, stray(scene, rng))
     operator = LatentSafeScripted(LatentSafeScriptedConfig(behavior=source.behavior(episode), seed=episode))
     failed = False
     with operator:
@@ -195,7 +202,12 @@ def _grasp(robot: "LatentSafeFrankaMujoco", seed: int, grasps: tuple[float, floa
 
     rng = np.random.default_rng([7, seed])
     segment = rng.choice([bag.TAIL, bag.MIDDLE, bag.MOUTH], p=grasps)
+    return _go(robot, grasp(robot.scene, int(segment), rng))
+
+
+def _go(robot: "LatentSafeFrankaMujoco", actions: Iterator[np.ndarray]) -> int:
+    """Act, unrecorded. Returns the steps taken."""
     steps = 0
-    for steps, action in enumerate(grasp(robot.scene, int(segment), rng), 1):  # noqa: B007
+    for steps, action in enumerate(actions, 1):  # noqa: B007
         robot.send_action(dict(zip(ACTION_NAMES, action.tolist())))
     return steps

@@ -50,9 +50,7 @@ class FilterSetting:
     def load(self, base: str | None = None) -> LatentSafePolicy:
         """The filter, with the policy it is to shield, if any."""
         policy = LatentSafePolicy.from_pretrained(self.path).eval()
-        for name in ("law", "epsilon", "guard"):
-            setattr(policy.config, name, getattr(self, name))
-        policy.config.__post_init__()
+        policy.config.override(self, "law", "epsilon", "guard")
         if base is not None:
             policy.attach(base)
         return policy

@@ -36,7 +36,8 @@ def lookahead_episodes(base: BasePolicy, n_episodes: int, seed: int) -> Episodes
         outcomes.append((info["is_success"], info["failure"], env.steps, overridden, change))
     env.close()
     success, violation, steps, overridden, change = map(np.array, zip(*outcomes))
-    return Episodes(success.astype(bool) & ~violation.astype(bool), violation.astype(bool), steps, overridden, change)
+    success, violation = success.astype(bool), violation.astype(bool)
+    return Episodes(success & ~violation, violation, steps, overridden, change, np.full(n_episodes, np.nan))
 
 
 @torch.no_grad()

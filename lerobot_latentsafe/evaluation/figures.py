@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from lerobot_latentsafe.envs import dubins
 from lerobot_latentsafe.evaluation.ground_truth import exact_value
 from lerobot_latentsafe.evaluation.monitor import Monitor
+from lerobot_latentsafe.evaluation.rollouts import wilson
 from lerobot_latentsafe.evaluation.shielding import Episodes
 
 
@@ -65,6 +66,20 @@ def trajectories(episodes: dict[str, Episodes]) -> Figure:
         ax.set(title=f"{name}: {rate:.0%} enter the disc", aspect="equal", xlim=(-1.15, 1.15), ylim=(-1.15, 1.15))
         ax.set(xlabel="x (m)", ylabel="y (m)")
     figure.tight_layout()
+    return figure
+
+
+def severities(episodes: dict[str, Episodes]) -> Figure:
+    """Share of the runs that spilled at least so much, with Wilson intervals (the paper's figure)."""
+    figure, ax = plt.subplots(figsize=(6, 3.2))
+    shares = np.linspace(0.01, 1, 100)
+    for (name, runs), colour in zip(episodes.items(), ("tab:red", "tab:blue")):
+        rates = [wilson((runs.severity >= share - 1e-9).sum(), len(runs.severity)) for share in shares]
+        ax.plot(100 * shares, [100 * rate["k"] / rate["n"] for rate in rates], color=colour, label=name)
+        low, high = ([100 * rate[end] for rate in rates] for end in ("low", "high"))
+        ax.fill_between(100 * shares, low, high, color=colour, alpha=0.15)
+    ax.set(xlabel="at least so much spilled (%)", ylabel="runs (%)", xlim=(0, 100), ylim=(0, 102))
+    ax.legend()
     return figure
 
 

@@ -8,9 +8,12 @@ import torch
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_latentsafe.evaluation import figures, report
-from lerobot_latentsafe.evaluation.rollouts import provenance
-from lerobot_latentsafe.evaluation.shielding import Episodes, check_environment, compare
+from lerobot_latentsafe.evaluation.album import Album
+from lerobot_latentsafe.evaluation.recordings import Recording
+from lerobot_latentsafe.evaluation.rollouts import provenance, wilson
+from lerobot_latentsafe.evaluation.shielding import Episodes, check_environment, compare, count_reasons
 from lerobot_latentsafe.filter import Reason
+from lerobot_latentsafe.labeling.frames import DatasetFrames
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.world_models.base import Latent
 
@@ -25,18 +28,27 @@ INTRODUCTION = (
 )
 
 
-def write_filter_report(path: Path, policy: LatentSafePolicy, env: EnvConfig, n_episodes: int, seed: int) -> None:
-    """Write the report; with a base policy, run it bare and shielded from the same starts first."""
-    policy.require_stage("reachability")
-    check_environment(policy, env)
+def write_filter_report(
+    path: Path, policy: LatentSafePolicy, env: EnvConfig | None, n_episodes: int, seed: int,
+    recorded: DatasetFrames | None = None,
+) -> None:  # fmt: skip
+    """Write the report.
+
+    Args:
+        env: with a base policy, the policy is run there first, bare and shielded from the same starts.
+        recorded: a dataset; what `latentsafe record` stored is shown, and where the world model cannot draw, its frames
+            illustrate what was imagined, beside those of the episodes that are run.
+    """
+    policy.require_stage(policy.needed_stage)
+    album = None if hasattr(policy.world_model, "decode") else Album(policy)
+    if album is not None and recorded is not None:
+        album.add_dataset(recorded)
     with TemporaryDirectory() as folder:
         parts = [report.paragraph(INTRODUCTION), *_about(policy)]
-        if policy.base is not None:
-            result = compare(policy, env, n_episodes, seed, min(n_episodes, LOOKED_THROUGH))
-            parts += _comparison(result, policy, env, Path(folder))
-            parts += _episodes(result["episodes"], policy, env, Path(folder))
-        if env.type == "latentsafe_dubins":
-            parts += _safe_set(policy, Path(folder))
+        if env is not None:
+            parts += _evaluation(policy, env, n_episodes, seed, Path(folder), album)
+        if recorded is not None and Recording.is_one(recorded):
+            parts += _recording(Recording(policy, recorded), Path(folder), album)
         made = provenance(seeds=[seed])
         parts += [
             report.paragraph(
@@ -47,6 +59,21 @@ def write_filter_report(path: Path, policy: LatentSafePolicy, env: EnvConfig, n_
             report.paragraph(f"Made by {made['command']} at commit {made['commit']}, {made['date']}."),
         ]
         report.write_report(path, "What this safety filter does", parts)
+
+
+def _evaluation(
+    policy: LatentSafePolicy, env: EnvConfig, n_episodes: int, seed: int, folder: Path, album: Album | None
+) -> list[str]:
+    """What the filter changes in an environment, and what it knows of it."""
+    check_environment(policy, env)
+    parts = []
+    if policy.base is not None:
+        result = compare(policy, env, n_episodes, seed, min(n_episodes, LOOKED_THROUGH), album)
+        parts += _comparison(result, policy, env, folder)
+        parts += _episodes(result["episodes"], policy, env, folder, album)
+    if env.type == "latentsafe_dubins":
+        parts += _safe_set(policy, folder)
+    return parts
 
 
 def _about(policy: LatentSafePolicy) -> list[str]:
@@ -92,36 +119,77 @@ def _comparison(result: dict, policy: LatentSafePolicy, env: EnvConfig, folder: 
         parts.append(
             report.picture(folder / "paths.png", "Where the car went. Red entered the disc; orange: the filter acts.")
         )
+    if np.isfinite(result["episodes"]["bare"].severity).all():
+        parts += _severity(result["episodes"], folder)
     return parts
 
 
-def _episodes(runs: dict[str, Episodes], policy: LatentSafePolicy, env: EnvConfig, folder: Path) -> list[str]:
-    parts = [
-        report.heading("Episodes"),
-        report.paragraph(
-            "Left without the filter, right with it; an orange frame while the filter acts. Under each video: the "
-            "value of what the policy wants to do next, with the threshold dashed, and the margin of what is seen now "
-            "(below zero it looks like a failure already). Then each command, as wanted and as executed. Steps at "
-            "which the filter acted are shaded. Click into a curve to go there."
-        ),
+def _severity(runs: dict[str, Episodes], folder: Path) -> list[str]:
+    """How bad the failures were: how many runs spilled at least so much."""
+    figures.save(figures.severities(runs), folder / "severity.png")
+    least = (0.05, 0.25, 0.5, 1.0)
+    rows = [
+        [name, *(report.share(wilson((r.severity >= share).sum(), len(r.severity))) for share in least)]
+        for name, r in runs.items()
     ]
+    return [
+        report.heading("How much was spilled"),
+        report.picture(folder / "severity.png", "Runs that spilled at least so much. Shaded: 95% intervals (Wilson)."),
+        report.table(["runs that spilled at least", *(f"{share:.0%}" for share in least)], rows),
+    ]
+
+
+def _episodes(
+    runs: dict[str, Episodes], policy: LatentSafePolicy, env: EnvConfig, folder: Path, album: Album | None
+) -> list[str]:
+    side_by_side = "Left without the filter, right with it; an orange frame while the filter acts. "
+    parts = [report.heading("Episodes"), report.paragraph(side_by_side + CURVES)]
     for i in _worth_showing(runs["bare"], runs["shielded"]):
-        shown = {name: Episodes(*[getattr(r, k)[i : i + 1] for k in _FIELDS]) for name, r in runs.items()}
-        (video,) = figures.write_videos(shown, folder / f"episode_{i}", env.fps)
         outcome = {name: "fails" if r.violation[i] else "stays safe" for name, r in runs.items()}
         parts.append(f"<h3>Episode {i}: {outcome['bare']} without the filter, {outcome['shielded']} with it</h3>")
-        trace, frames = runs["shielded"].traces[i], runs["shielded"].frames[i]
-        seconds = max(len(r.frames[i]) for r in runs.values()) / env.fps
-        parts.append(
-            report.player(
-                video, _charts(trace, policy, env.fps, seconds), seconds, "", _printed(trace, frames, env.fps)
-            )
-        )
-        parts += _feared(trace, runs["shielded"].latents[i], policy, env.fps)
+        parts += _played({name: r.only(i) for name, r in runs.items()}, policy, env.fps, folder / f"run_{i}", album)
     return parts
 
 
-_FIELDS = ("success", "violation", "steps", "overridden", "action_change", "traces", "frames", "latents")
+def _recording(recording: Recording, folder: Path, album: Album | None) -> list[str]:
+    """The recorded episodes in which the filter acted most."""
+    policy, fps, decisions = recording.policy, recording.frames.meta.fps, recording.decisions
+    acted = np.bincount(recording.episode, decisions["intervened"]).astype(int)
+    steps = np.bincount(recording.episode)
+    parts = [
+        report.heading("Recorded under the filter"),
+        report.paragraph(
+            f"{recording.frames.meta.repo_id}: {len(acted)} episodes; the filter acted in {(acted > 0).sum()} of them, "
+            f"and in {acted.sum() / steps.sum():.1%} of all steps."
+        ),
+        report.table(["why a step was judged as it was", "steps"], list(count_reasons(decisions["reason"]).items())),
+        report.paragraph("The episodes in which it acted most; an orange frame while it acts. " + CURVES),
+    ]
+    for i in np.argsort(-acted, kind="stable")[:SHOWN].tolist():
+        parts.append(f"<h3>Episode {i}: the filter acts in {acted[i]} of {steps[i]} steps</h3>")
+        parts += _played({"recorded": recording.read(i)}, policy, fps, folder / f"recorded_{i}", album)
+    return parts
+
+
+CURVES = (
+    "Under each video: the value of what the policy or person wants to do next, with the threshold dashed, and the "
+    "margin of what is seen now (below zero it looks like a failure already). Then each command, as wanted and as "
+    "executed. Steps at which the filter acted are shaded. Click into a curve to go there."
+)
+
+
+def _played(
+    runs: dict[str, Episodes], policy: LatentSafePolicy, fps: int, folder: Path, album: Album | None
+) -> list[str]:
+    """Runs of one episode each, side by side in a video, with the curves and fears of the last, which was filtered."""
+    (video,) = figures.write_videos(runs, folder, fps)
+    filtered = list(runs.values())[-1]
+    trace, seconds = filtered.traces[0], max(len(r.frames[0]) for r in runs.values()) / fps
+    charts, printed = _charts(trace, policy, fps, seconds), _printed(trace, filtered.frames[0], fps)
+    return [
+        report.player(video, charts, seconds, "", printed),
+        *_feared(trace, filtered.latents[0], policy, fps, album),
+    ]
 
 
 def _worth_showing(bare: Episodes, shielded: Episodes) -> list[int]:
@@ -140,10 +208,11 @@ def _charts(trace: dict[str, list], policy: LatentSafePolicy, fps: int, seconds:
     values = {"value of the wanted action": padded(trace["value"]), "margin now": padded(trace["margin"])}
     charts = [report.chart(values, fps, shaded, policy.config.epsilon, (-1.0, 1.0), "dashed: threshold")]
     proposed, executed = np.array(trace["proposed"]), np.array(trace["action"])
+    limits = list(zip(policy.config.action_low, policy.config.action_high))
     for j, name in enumerate(policy.config.action_names):
         if policy.config.action_varies[j]:
             commands = {f"{name} executed": padded(executed[:, j]), "wanted": padded(proposed[:, j])}
-            charts.append(report.chart(commands, fps, shaded))
+            charts.append(report.chart(commands, fps, shaded, limits=limits[j]))
     return charts
 
 
@@ -153,18 +222,24 @@ def _printed(trace: dict[str, list], frames: list[np.ndarray], fps: int) -> str:
     return report.strip([frames[t] for t in picked], captions, [bool(trace["intervened"][t]) for t in picked])
 
 
-def _feared(trace: dict[str, list], latents: list[Latent], policy: LatentSafePolicy, fps: int) -> list[str]:
+def _feared(
+    trace: dict[str, list], latents: list[Latent], policy: LatentSafePolicy, fps: int, album: Album | None
+) -> list[str]:
     """What the filter imagined when it first acted: the wanted action held on, and its own way out."""
     acted = np.flatnonzero(np.array(trace["reason"]) == Reason.UNSAFE_VALUE)
     if not len(acted):
         return [report.paragraph("The filter never saw a reason to act here.")]
-    if not hasattr(policy.world_model, "decode"):
-        return [report.paragraph("This world model cannot draw what it imagines.")]
     first = int(acted[0])
     wanted = policy.normalise_action(torch.tensor([trace["proposed"][first]], device=policy.device)).clamp(-1, 1)
-    parts = [report.paragraph(f"What the filter imagined when it first acted, {first / fps:.2f} s into the episode:")]
+    said = f"What the filter imagined when it first acted, {first / fps:.2f} s into the episode:"
+    if album is not None:
+        said += (
+            " its world model cannot draw, so each picture is the one, of the "
+            f"{len(album):,} it has seen here, that it holds for most like what it imagines."
+        )
+    parts = [report.paragraph(said)]
     for name, action in (("the wanted action, held on", wanted), ("its own fallback", None)):
-        images, margins = imagine(policy, latents[first], action)
+        images, margins = imagine(policy, latents[first], action, album)
         captions = [f"+{(k + 1) / fps:.2f} s, l = {l:+.2f}" for k, l in enumerate(margins)]
         every = slice(1, None, IMAGINED // PRINTED)
         picture = report.strip(images[every], captions[every], [l < 0 for l in margins[every]])
@@ -174,22 +249,27 @@ def _feared(trace: dict[str, list], latents: list[Latent], policy: LatentSafePol
 
 @torch.no_grad()
 def imagine(
-    policy: LatentSafePolicy, latent: Latent, action: torch.Tensor | None
+    policy: LatentSafePolicy, latent: Latent, action: torch.Tensor | None, album: Album | None = None
 ) -> tuple[list[np.ndarray], list[float]]:
     """Pictures of the first camera and margins of IMAGINED steps from a latent (1, ...).
 
     Args:
         action: (1, A) in [-1, 1], held on; None asks the fallback policy at every step.
+        album: where to look for pictures; None has the world model decode them.
     """
     model, images, margins = policy.world_model, [], []
     for _ in range(IMAGINED):
         held = policy.plan(latent)[1] if action is None else action
         latent = model.step(latent, held)
-        features = model.features(latent)
-        picture = model.decode(features)[policy.config.cameras[0]][0].clamp(0, 1)
-        images.append((picture.permute(1, 2, 0).cpu().numpy() * 255).round().astype(np.uint8))
-        margins.append(policy.margin.bounded(features).item())
+        images.append(_decoded(policy, latent) if album is None else album.nearest(latent))
+        margins.append(policy.imagination.margin(latent).item())
     return images, margins
+
+
+def _decoded(policy: LatentSafePolicy, latent: Latent) -> np.ndarray:
+    """The first camera's picture (H, W, 3), uint8, as the world model draws a latent (1, ...)."""
+    picture = policy.world_model.decode(policy.world_model.features(latent))[policy.config.cameras[0]][0].clamp(0, 1)
+    return (picture.permute(1, 2, 0).cpu().numpy() * 255).round().astype(np.uint8)
 
 
 def _safe_set(policy: LatentSafePolicy, folder: Path) -> list[str]:

@@ -1,12 +1,13 @@
 """Bare against shielded: the same policy from the same starts, with and without the filter."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 import torch
 from lerobot.envs import make_env, preprocess_observation
 from lerobot.envs.configs import EnvConfig
 
+from lerobot_latentsafe.evaluation.album import Album
 from lerobot_latentsafe.evaluation.rollouts import paired_p_value, wilson
 from lerobot_latentsafe.filter import FilterDecision, Reason
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
@@ -23,6 +24,7 @@ class Episodes:
         steps: int (n,) steps driven.
         overridden: int (n,) steps at which the fallback acted.
         action_change: (n,) summed distance between executed and proposed action, robot units.
+        severity: (n,) the largest share spilled at any step; not a number where there is nothing to spill.
         traces: one dict of lists an episode: action, proposed, value, margin, intervened, reason, state.
         frames: RGB frames of the episodes asked for.
         latents: the filter's latents (1, ...) at each step of those.
@@ -33,6 +35,7 @@ class Episodes:
     steps: np.ndarray
     overridden: np.ndarray
     action_change: np.ndarray
+    severity: np.ndarray
     traces: list[dict[str, list]] = field(default_factory=list)
     frames: list[list[np.ndarray]] = field(default_factory=list)
     latents: list[list[Latent]] = field(default_factory=list)
@@ -49,9 +52,13 @@ class Episodes:
             "mean_action_change": float(self.action_change.sum() / self.steps.sum()),
         }
 
+    def only(self, i: int) -> "Episodes":
+        """One of them."""
+        return Episodes(*(getattr(self, f.name)[i : i + 1] for f in fields(self)))
+
     @classmethod
     def joined(cls, parts: "list[Episodes]") -> "Episodes":
-        arrays = ("success", "violation", "steps", "overridden", "action_change")
+        arrays = ("success", "violation", "steps", "overridden", "action_change", "severity")
         joined = {name: np.concatenate([getattr(p, name) for p in parts]) for name in arrays}
         lists = {name: [x for p in parts for x in getattr(p, name)] for name in ("traces", "frames", "latents")}
         return cls(**joined, **lists)
@@ -80,7 +87,7 @@ def check_environment(policy: LatentSafePolicy, env: EnvConfig) -> None:
 
 def run_episodes(
     actor: BasePolicy | LatentSafePolicy, env: EnvConfig, n_episodes: int, seed: int,
-    batch_size: int = 50, n_videos: int = 0,
+    batch_size: int = 50, n_videos: int = 0, album: Album | None = None,
 ) -> Episodes:  # fmt: skip
     """Run episodes with seeds seed, seed + 1, ...; equal seeds give equal starts.
 
@@ -88,61 +95,84 @@ def run_episodes(
         actor: a bare policy, or a filter with or without a base policy.
         batch_size: environments stepped together.
         n_videos: of the first so many episodes, keep frames.
+        album: put these frames in, too.
     """
     parts = []
     for first in range(0, n_episodes, batch_size):
         n = min(batch_size, n_episodes - first)
         torch.manual_seed(seed + first)  # a diffusion policy samples
-        parts.append(_run_batch(actor, env, [seed + first + i for i in range(n)], max(0, n_videos - first)))
+        parts.append(_run_batch(actor, env, [seed + first + i for i in range(n)], max(0, n_videos - first), album))
     return Episodes.joined(parts)
 
 
 @torch.no_grad()
-def _run_batch(actor: BasePolicy | LatentSafePolicy, env: EnvConfig, seeds: list[int], n_videos: int) -> Episodes:
-    n, n_videos = len(seeds), min(n_videos, len(seeds))
-    vector_env = next(iter(make_env(env, n_envs=n).values()))[0]
+def _run_batch(
+    actor: BasePolicy | LatentSafePolicy, env: EnvConfig, seeds: list[int], n_videos: int, album: Album | None
+) -> Episodes:
+    vector_env = next(iter(make_env(env, n_envs=len(seeds)).values()))[0]
     task = vector_env.call("task_description")
     actor.reset()
     observation, info = vector_env.reset(seed=seeds)
-    done, success = np.zeros(n, bool), np.zeros(n, bool)
-    violation = np.asarray(info["failure"], bool).copy()
-    steps, overridden, change = np.zeros(n, int), np.zeros(n, int), np.zeros(n)
-    traces: list[dict[str, list]] = [{} for _ in range(n)]
-    _record(traces, ~done, state=np.asarray(info["state"]) if "state" in info else None)
-    render = lambda: vector_env.call("render")[:n_videos] if n_videos else ()  # noqa: E731
-    frames = [[frame] for frame in render()]
-    latents: list[list[Latent]] = [[] for _ in frames]
+    render = lambda: vector_env.call("render")[:n_videos] if n_videos else []  # noqa: E731
+    runs, done = _begun(info, render()), np.zeros(len(seeds), bool)
     while not done.all():
         batch = {**preprocess_observation(observation), "task": list(task)}
+        alive, filmed = ~done, np.flatnonzero(~done[:n_videos])
+        if album is not None and len(filmed):
+            seen = {key: batch[key][filmed] for key in album.policy.world_model.image_keys}
+            album.add([runs.frames[i][-1] for i in filmed], seen, batch["observation.state"][filmed])
         action, decision = _act(actor, batch)
-        alive = ~done
-        steps += alive
+        runs.steps[alive] += 1
         if decision is not None:
-            _record(
-                traces, alive, proposed=decision.proposed, value=decision.value, margin=decision.margin,
-                intervened=decision.intervened, reason=decision.reason,
-            )  # fmt: skip
-            for i in np.flatnonzero(alive[:n_videos]):
-                latents[i].append(select(actor.shield.latent, slice(i, i + 1)))
-            overridden += alive & decision.intervened.cpu().numpy()
-            moved = (decision.action - decision.proposed).norm(dim=-1).nan_to_num(0.0).cpu().numpy()
-            change += np.where(alive, moved, 0.0)
+            _note_decision(runs, decision, alive)
+            for i in filmed:
+                runs.latents[i].append(select(actor.shield.latent, slice(i, i + 1)))
         observation, _, terminated, truncated, info = vector_env.step(action)
         over = terminated | truncated
         final = info.get("final_info", info)
         for i in np.flatnonzero(alive):
-            source = final if over[i] else info
-            violation[i] |= bool(source["failure"][i])
-            success[i] = bool(source["is_success"][i])
-            if "state" in source:
-                traces[i].setdefault("state", []).append(np.asarray(source["state"][i]).tolist())
-        _record(traces, alive, action=torch.from_numpy(action))
-        for kept, frame, running in zip(frames, render(), alive[:n_videos] & ~over[:n_videos]):
-            if running:
-                kept.append(frame)
+            _note_outcome(runs, i, final if over[i] else info)
+        _record(runs.traces, alive, action=torch.from_numpy(action))
+        pictures = render()
+        for i in filmed[~over[filmed]]:
+            runs.frames[i].append(pictures[i])
         done |= over
     vector_env.close()
-    return Episodes(success & ~violation, violation, steps, overridden, change, traces, frames, latents)
+    runs.success &= ~runs.violation
+    return runs
+
+
+def _begun(info: dict, pictures: list[np.ndarray]) -> Episodes:
+    """Episodes of which the first frame has been seen."""
+    violation = np.array(info["failure"], bool)
+    n = len(violation)
+    runs = Episodes(
+        success=np.zeros(n, bool), violation=violation, steps=np.zeros(n, int), overridden=np.zeros(n, int),
+        action_change=np.zeros(n), severity=np.full(n, np.nan),
+        traces=[{} for _ in range(n)], frames=[[p] for p in pictures], latents=[[] for _ in pictures],
+    )  # fmt: skip
+    _record(runs.traces, np.ones(n, bool), state=np.asarray(info["state"]) if "state" in info else None)
+    return runs
+
+
+def _note_decision(runs: Episodes, decision: FilterDecision, alive: np.ndarray) -> None:
+    _record(
+        runs.traces, alive, proposed=decision.proposed, value=decision.value, margin=decision.margin,
+        intervened=decision.intervened, reason=decision.reason,
+    )  # fmt: skip
+    runs.overridden[alive & decision.intervened.cpu().numpy()] += 1
+    moved = (decision.action - decision.proposed).norm(dim=-1).nan_to_num(0.0).cpu().numpy()
+    runs.action_change[alive] += moved[alive]
+
+
+def _note_outcome(runs: Episodes, i: int, info: dict) -> None:
+    """What the environment said of episode i after a step."""
+    runs.violation[i] |= bool(info["failure"][i])
+    runs.success[i] = bool(info["is_success"][i])
+    if "spill_fraction" in info:
+        runs.severity[i] = np.fmax(runs.severity[i], info["spill_fraction"][i])
+    if "state" in info:
+        runs.traces[i].setdefault("state", []).append(np.asarray(info["state"][i]).tolist())
 
 
 def _act(actor: BasePolicy | LatentSafePolicy, batch: dict) -> tuple[np.ndarray, FilterDecision | None]:
@@ -162,8 +192,10 @@ def _record(traces: list[dict[str, list]], alive: np.ndarray, **columns) -> None
             traces[i].setdefault(name, []).append(values[i])
 
 
-def compare(policy: LatentSafePolicy, env: EnvConfig, n_episodes: int, seed: int, n_videos: int = 0) -> dict:
-    """Bare and shielded from the same starts.
+def compare(
+    policy: LatentSafePolicy, env: EnvConfig, n_episodes: int, seed: int, n_videos: int = 0, album: Album | None = None
+) -> dict:
+    """Bare and shielded from the same starts; the frames of the first n_videos episodes are kept, and go to the album.
 
     Returns:
         bare, shielded: rates; violation_p_value: exact McNemar test on the pairs; episodes: both `Episodes`.
@@ -171,13 +203,18 @@ def compare(policy: LatentSafePolicy, env: EnvConfig, n_episodes: int, seed: int
     check_environment(policy, env)
     if policy.base is None:
         raise ValueError("nothing to shield: give --base_policy_path, or a checkpoint written by latentsafe wrap")
-    bare = run_episodes(policy.base, env, n_episodes, seed, n_videos=n_videos)
-    shielded = run_episodes(policy, env, n_episodes, seed, n_videos=n_videos)
-    reasons = np.bincount([r for t in shielded.traces for r in t["reason"]], minlength=len(Reason))
+    bare = run_episodes(policy.base, env, n_episodes, seed, n_videos=n_videos, album=album)
+    shielded = run_episodes(policy, env, n_episodes, seed, n_videos=n_videos, album=album)
     return {
         "bare": bare.rates(),
         "shielded": shielded.rates(),
         "violation_p_value": paired_p_value(bare.violation, shielded.violation),
-        "reasons": {reason.name.lower(): int(reasons[reason]) for reason in Reason if reasons[reason]},
+        "reasons": count_reasons([reason for trace in shielded.traces for reason in trace["reason"]]),
         "episodes": {"bare": bare, "shielded": shielded},
     }
+
+
+def count_reasons(reasons: "np.ndarray | list[int]") -> dict[str, int]:
+    """How many decisions were made for each reason that occurs."""
+    counts = np.bincount(reasons, minlength=len(Reason))
+    return {reason.name.lower(): int(counts[reason]) for reason in Reason if counts[reason]}

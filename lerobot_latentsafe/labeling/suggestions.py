@@ -5,11 +5,15 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE
 from lerobot_latentsafe.labeling.frames import DatasetFrames
+
+if TYPE_CHECKING:
+    from lerobot_latentsafe.world_models.base import Latent
 
 WORST = 5
 """Frames an episode is judged by: a short doubt in a long certain episode counts."""
@@ -52,11 +56,12 @@ def contradiction(margin: np.ndarray, failure: np.ndarray) -> float:
     return float(wrong[-WORST:].mean()) if len(wrong) else 0.0
 
 
-def episode_margins(policy, frames: DatasetFrames, batch_size: int = 16) -> Iterator[tuple[int, np.ndarray]]:
-    """Margins (T,) along every episode, filtered from its first frame: (episode, margin) in order.
+def check_fit(policy, frames: DatasetFrames) -> None:
+    """Refuse a dataset of another robot, rate or camera than the filter's, and a filter without a world model.
 
     Raises:
-        ValueError: the dataset is of another robot, rate or camera than the filter's.
+        ValueError: naming what differs.
+        UntrainedFilterError: the world model was never trained.
     """
     from lerobot_latentsafe.modeling_latentsafe import adopt_dataset
 
@@ -67,6 +72,15 @@ def episode_margins(policy, frames: DatasetFrames, batch_size: int = 16) -> Iter
         raise ValueError(
             f"the filter looks through {', '.join(missing)}, {frames.meta.repo_id} has {', '.join(frames.cameras)}"
         )
+
+
+def episode_margins(policy, frames: DatasetFrames, batch_size: int = 16) -> Iterator[tuple[int, np.ndarray]]:
+    """Margins (T,) along every episode, filtered from its first frame: (episode, margin) in order.
+
+    Raises:
+        ValueError: the dataset is of another robot, rate or camera than the filter's.
+    """
+    check_fit(policy, frames)
     episodes = range(frames.meta.total_episodes)
     for first in episodes[::batch_size]:
         batch = list(episodes[first : first + batch_size])
@@ -74,7 +88,18 @@ def episode_margins(policy, frames: DatasetFrames, batch_size: int = 16) -> Iter
 
 
 def _margins(policy, frames: DatasetFrames, episodes: list[int]) -> list[np.ndarray]:
-    """Margins of a few episodes, encoded side by side."""
+    """Margins of a few episodes."""
+    latents, length = encode_episodes(policy, frames, episodes)
+    margin = policy.imagination.margin(latents).detach().cpu().numpy()
+    return [row[:n] for row, n in zip(margin, length)]
+
+
+def encode_episodes(policy, frames: DatasetFrames, episodes: list[int]) -> "tuple[Latent, list[int]]":
+    """What the filter makes of a few episodes, filtered from their first frames, side by side.
+
+    Returns:
+        Latents (B, T, ...) for the longest one's T frames, and how many are the episode's own, of each.
+    """
     import torch
 
     from lerobot_latentsafe.world_models.base import Clip
@@ -94,8 +119,7 @@ def _margins(policy, frames: DatasetFrames, episodes: list[int]) -> list[np.ndar
         percepts, stack([state for _, state, _ in seen]), previous, is_first.to(policy.device), valid, unknown, unknown
     )
     with torch.no_grad():
-        margin = policy.margin.bounded(policy.world_model.features(policy.world_model.encode(clip))).cpu().numpy()
-    return [row[:n] for row, n in zip(margin, length)]
+        return policy.world_model.encode(clip), length
 
 
 def _model_inputs(policy, frames: DatasetFrames, episode: int):

@@ -34,8 +34,8 @@ MOVED = 0.05
 class LatentSafeShielded(Robot):
     """To LeRobot it is the inner robot: same name, features, cameras. What is sent to it goes through the filter.
 
-    Observations also hold `shield.value`, `shield.margin` and `shield.intervened` of the last decision: recordings
-    leave them out, `--display_data=true` shows them.
+    Observations also hold `shield.value`, `shield.margin` (not a number before the first decision) and
+    `shield.intervened` of the last decision: recordings leave them out, `--display_data=true` shows them.
     """
 
     config_class = LatentSafeShieldedConfig
@@ -49,10 +49,7 @@ class LatentSafeShielded(Robot):
         self.inner = make_robot_from_config(config.inner)
         self.name = self.robot_type = self.inner.name
         self.filter = LatentSafePolicy.from_pretrained(config.filter).eval()
-        for option in ("mode", "epsilon", "guard"):
-            if getattr(config, option) is not None:
-                setattr(self.filter.config, option, getattr(config, option))
-        self.filter.config.__post_init__()  # checks what was changed
+        self.filter.config.override(config, "mode", "epsilon", "guard")
         if config.device:
             self.filter.to(config.device)
         self.filter.require_stage(self.filter.needed_stage)
@@ -158,12 +155,14 @@ class LatentSafeShielded(Robot):
         self._seen_at = time.perf_counter()
         self._fresh = True
         self._watch_cameras()
+        return {**self._observation, **self._shown()}
+
+    def _shown(self) -> dict[str, float]:
+        """The last decision as numbers; there from the first tick on, for a display lays out what it sees first."""
         decision = self.filter.shield.decision
-        shown = {} if decision is None else {"value": decision.value, "margin": decision.margin}
-        shown = {f"shield.{name}": value.item() for name, value in shown.items()}
-        if decision is not None:
-            shown["shield.intervened"] = float(decision.intervened.item())
-        return {**self._observation, **shown}
+        if decision is None:
+            return {"shield.value": math.nan, "shield.margin": math.nan, "shield.intervened": 0.0}
+        return {f"shield.{name}": float(getattr(decision, name).item()) for name in ("value", "margin", "intervened")}
 
     def send_action(self, action: dict[str, float]) -> dict[str, float]:
         """Filter an action and have the inner robot execute the result.

@@ -64,6 +64,13 @@ def grasp(scene: bag.BagScene, segment: int, rng: np.random.Generator) -> Action
     yield from hold(CLOSED, 9)
 
 
+def stray(scene: bag.BagScene, rng: np.random.Generator) -> Actions:
+    """Go somewhere above the bag, turned at random: where a policy may find itself that went astray."""
+    above = scene.segment_position(bag.MIDDLE)[:2] + rng.uniform(-0.12, 0.12, 2)
+    yaw = scene.yaw + rng.uniform(-0.8, 0.8)
+    yield from reach(scene, np.append(above, rng.uniform(0.07, 0.25)), MAX_SPEED, OPEN, yaw)
+
+
 def lift(scene: bag.BagScene, segment: int, speed: float, rng: np.random.Generator) -> Actions:
     """Grasp a segment, lift it and hold it up."""
     yield from grasp(scene, segment, rng)
