@@ -4,6 +4,7 @@ Importing this package registers the policy, environments, robots, teleoperators
 registries, and loads nothing heavy: models and simulators are imported when they are used.
 """
 
+from lerobot_latentsafe.baselines.dreamer.configuration_dreamer import LatentSafeDreamerConfig
 from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
 from lerobot_latentsafe.envs.configuration_envs import LatentSafeBagEnv, LatentSafeBlocksEnv, LatentSafeDubinsEnv
 from lerobot_latentsafe.perceive import PerceiveStep
@@ -17,6 +18,7 @@ __all__ = [
     "LatentSafeBagEnv",
     "LatentSafeBlocksEnv",
     "LatentSafeConfig",
+    "LatentSafeDreamerConfig",
     "LatentSafeDubinsEnv",
     "LatentSafeEndEffectorConfig",
     "LatentSafeFrankaConfig",

@@ -13,6 +13,7 @@ VERBS: dict[str, tuple[str, str]] = {
         "TrainReachability",
         "learn the safety value and the fallback in a world model's imagination",
     ),
+    "train-dreamer": ("baselines.dreamer.training.TrainDreamer", "learn the blocks' task policy in imagination"),
     "calibrate": ("Calibrate", "choose epsilon on held-out episodes and store the evidence"),
     "wrap": ("Wrap", "write a filter and the policy it shields as one self-contained folder"),
     "push": ("Push", "push a filter, or a shielded policy, to the Hub with its card"),

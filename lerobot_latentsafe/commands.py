@@ -204,6 +204,8 @@ class TrainReachability:
     seeds: list[int] = field(default_factory=lambda: [0])
     steps: int | None = None
     """Gradient steps; None takes the configuration's."""
+    target: str = "reachability"
+    """What the critic learns: the safety value (reachability), or SQRL's risk of failing, a baseline."""
 
     def run(self) -> None:
         from lerobot_latentsafe import ranks
@@ -212,7 +214,8 @@ class TrainReachability:
         with ranks.joined():
             for seed in self.seeds:
                 output_dir = self.output_dir if len(self.seeds) == 1 else self.output_dir / f"seed_{seed}"
-                train_reachability(self.policy.path, self.dataset.metadata(), output_dir, seed, self.steps)
+                meta = self.dataset.metadata()
+                train_reachability(self.policy.path, meta, output_dir, seed, self.steps, self.target)
                 if ranks.rank() == 0:
                     print(f"filter with a trained critic in {output_dir}")
 
@@ -280,7 +283,7 @@ class Wrap:
 
 @dataclass
 class Push:
-    """Push a filter, or a shielded policy, to the Hub with its card."""
+    """Push a filter, a shielded policy or a task policy of train-dreamer to the Hub with its card."""
 
     policy: PolicySource
     repo_id: str
@@ -292,11 +295,17 @@ class Push:
     private: bool = False
 
     def run(self) -> None:
+        from lerobot.configs.policies import PreTrainedConfig
+
+        from lerobot_latentsafe.baselines.dreamer.modeling_dreamer import LatentSafeDreamerPolicy
+        from lerobot_latentsafe.checkpoint import resolve_checkpoint
         from lerobot_latentsafe.hub import push_filter
         from lerobot_latentsafe.model_card import measured
         from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 
-        policy = LatentSafePolicy.from_pretrained(self.policy.path)
+        kind = PreTrainedConfig.from_pretrained(resolve_checkpoint(self.policy.path)).type
+        policy_class = LatentSafeDreamerPolicy if kind == LatentSafeDreamerPolicy.name else LatentSafePolicy
+        policy = policy_class.from_pretrained(self.policy.path)
         if self.base_policy_path:
             policy.attach(self.base_policy_path)
         for file in self.results:

@@ -6,12 +6,16 @@ from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import NormalizationMode
 from lerobot.optim import AdamConfig, CosineDecayWithWarmupSchedulerConfig
 
-from lerobot_latentsafe.reachability import ReachabilityConfig
+from lerobot_latentsafe.reachability import BACKUPS, ReachabilityConfig
 from lerobot_latentsafe.world_models import RSSMConfig, WorldModelConfig
 
 STAGES = ("untrained", "world_model", "reachability")
 MODES = ("filter", "monitor")
-LAWS = ("reachability", "plan", "margin")
+LAWS = ("reachability", "risk", "plan", "margin")
+
+
+class CriticTargetError(ValueError):
+    """A critic is asked for what it was not trained to say: a risk read as a safety value, or the reverse."""
 
 
 @PreTrainedConfig.register_subclass("latentsafe")
@@ -31,19 +35,25 @@ class LatentSafeConfig(PreTrainedConfig):
         action_candidates: the discrete action set in robot units, e.g. [[-1.25, 1], [0, 1], [1.25, 1]]; None:
             actions are continuous.
         stage: how far training has come: untrained, world_model, reachability. Set by the training commands.
-        epsilon: the filter intervenes where V of the predicted next latent is at or below this.
+        target: what the critic was trained for: `reachability` (Eq. 5) or `risk` (SQRL). Set by
+            `latentsafe train-reachability`.
+        epsilon: the filter intervenes where V of the predicted next latent is at or below this. A risk critic's V is
+            -risk, so SQRL's threshold of 0.1 is an epsilon of -0.1.
         guard: steps for which the proposed action is imagined held before V is asked. 1 is the paper's law; more give
             room for what the world model gets wrong, as time, which a saturated margin cannot.
         calibration: the evidence epsilon was chosen on; written by `latentsafe calibrate`.
         evaluation: what was measured -> the rate in words; written by `latentsafe push --results=...` for the card.
         lookahead: steps of imagination before the critic's value is read, 0 to 25: V and the fallback are the best of
             the critic's policy and of holding each action. 0 is the critic alone, and the cheapest.
-        law: what V is: `reachability`; or a baseline that learns no value: `plan` imagines holding each action, and
-            `margin` reads l alone and stands still.
+        samples: next latents drawn from a stochastic world model, of which the worst counts; 0 imagines its mean or
+            mode. If any, the critic is trained on drawn latents, too.
+        law: what V is: `reachability`; or a baseline: `risk`, which needs a critic trained for it, `plan`, which
+            imagines holding each action, and `margin`, which reads l alone and stands still.
         mode: `filter` overrides unsafe actions, `monitor` only reports what it would have done.
         deadline_ms: if set, a decision that took longer is not trusted, and the fallback acts.
         base_policy_path: the policy to shield: a folder, a Hub id or the name of a committed checkpoint.
         cameras: the image features the filter reads, by default all of the dataset's.
+        task: what the world model was trained to imagine, in words, where a policy of the same task must share it.
         robot_type: LeRobot's name of the robot that recorded the dataset.
         fps, state_names, action_names, action_low, action_high, state_mean, state_std: what the filter was trained
             on, in robot units; filled in from the dataset.
@@ -71,9 +81,11 @@ class LatentSafeConfig(PreTrainedConfig):
     fallback_low: list[float] | None = None
     fallback_high: list[float] | None = None
     stage: str = "untrained"
+    target: str = "reachability"
 
     epsilon: float = 0.0
     guard: int = 1
+    samples: int = 0
     calibration: dict[str, float] = field(default_factory=dict)
     evaluation: dict[str, str] = field(default_factory=dict)
     lookahead: int = 15
@@ -82,6 +94,7 @@ class LatentSafeConfig(PreTrainedConfig):
     deadline_ms: float | None = None
     base_policy_path: str | None = None
 
+    task: str | None = None
     cameras: list[str] | None = None
     robot_type: str | None = None
     fps: int | None = None
@@ -120,8 +133,29 @@ class LatentSafeConfig(PreTrainedConfig):
             raise ValueError(f"--policy.lookahead is {self.lookahead}; expected 0 (critic alone) to 25 imagined steps")
         if not 1 <= self.guard <= 25:
             raise ValueError(f"--policy.guard is {self.guard}; expected 1 (the paper's law) to 25 steps")
+        if self.samples < 0:
+            raise ValueError(f"--policy.samples is {self.samples}; expected 0 (mean or mode) or a number of draws")
         if self.margin_delta <= 0:
             raise ValueError(f"--policy.margin_delta is {self.margin_delta}; expected a positive number")
+        self.require_critic_of_law()
+
+    def require_critic_of_law(self) -> None:
+        """Refuse a law that reads the critic as something it was not trained for.
+
+        Raises:
+            CriticTargetError: naming both.
+        """
+        if self.target not in BACKUPS:
+            raise ValueError(f"target is {self.target!r}; expected one of {', '.join(BACKUPS)}")
+        if self.stage == "reachability" and self.law in BACKUPS and self.law != self.target:
+            raise CriticTargetError(
+                f"--policy.law is {self.law!r}, but this filter's critic was trained for {self.target!r}; use it with "
+                f"--policy.law={self.target}, or train one with latentsafe train-reachability --target={self.law}"
+            )
+        if self.law == "risk" and self.lookahead:
+            raise ValueError(
+                f"--policy.lookahead is {self.lookahead}; a risk is read at the next latent: expected 0 with law 'risk'"
+            )
 
     def override(self, options: object, *names: str) -> None:
         """Take over those of these options that are given, as attributes that are not None.

@@ -3,7 +3,8 @@
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+from lerobot.policies.pretrained import PreTrainedPolicy
+
 from lerobot_latentsafe.training import save_filter
 
 
@@ -11,8 +12,9 @@ class HubUnreachableError(ConnectionError):
     """The Hub did not answer; nothing local was touched."""
 
 
-def push_filter(policy: LatentSafePolicy, repo_id: str, dataset_repo_id: str, private: bool = False) -> str:
-    """Upload weights, config, processors, the base policy if there is one, and a card. Returns the URL.
+def push_filter(policy: PreTrainedPolicy, repo_id: str, dataset_repo_id: str, private: bool = False) -> str:
+    """Upload a filter or task policy: weights, config, processors, the base policy or world model it comes with, and a
+    card. Returns the URL.
 
     The repository is created before anything is prepared, so that a Hub that is down is noticed at once.
 
@@ -39,7 +41,7 @@ def push_filter(policy: LatentSafePolicy, repo_id: str, dataset_repo_id: str, pr
         card = policy.generate_model_card(dataset_repo_id, "latentsafe", policy.config.license, policy.config.tags)
         card.save(Path(folder) / "README.md")
         try:
-            commit = api.upload_folder(repo_id=repo_id, folder_path=folder, commit_message="Push safety filter")
+            commit = api.upload_folder(repo_id=repo_id, folder_path=folder, commit_message=f"Push {policy.name} policy")
         except failures as e:
             raise HubUnreachableError(
                 f"upload to {repo_id} broke off ({type(e).__name__}: {e}); the filter on disk is untouched, push again"

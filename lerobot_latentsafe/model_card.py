@@ -3,11 +3,15 @@
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from huggingface_hub import ModelCard, ModelCardData
 
 from lerobot_latentsafe.configuration_latentsafe import LAWS, LatentSafeConfig
 from lerobot_latentsafe.evaluation.report import share
+
+if TYPE_CHECKING:
+    from lerobot_latentsafe.baselines.dreamer.configuration_dreamer import LatentSafeDreamerConfig
 
 TEXT = """---
 {header}
@@ -51,9 +55,46 @@ done.
 
 - V means nothing outside of what the data covered: other cameras, objects, dynamics, lighting. Nothing detects that.
 - It acts at the last moment and with the fallback's full action; it looks for no safe action near the proposed one.
-- Imagination is deterministic: what is random in the world is foreseen as its mean.
+- {imagination}
 - A policy under it cannot tell that a frame is late or frozen; a robot under it (`latentsafe_shielded`) can.
 """
+
+TASK_POLICY_TEXT = """---
+{header}
+---
+
+# Task policy learned in imagination
+
+An actor-critic in the imagination of a world model (the DreamerV3 recipe) whose task is to {task}. It is the policy
+that a latent safety filter shields in our study: **it fails at times, on purpose**, for its reward prices failures
+instead of forbidding them. It was trained on `{dataset}`; its world model is in `world_model/`.
+
+```bash
+pip install lerobot_policy_latentsafe
+lerobot-eval --policy.path={repo_id} --env.type=...
+```
+"""
+
+
+def make_task_policy_card(
+    config: "LatentSafeDreamerConfig", dataset_repo_id: str, license: str | None, tags: list[str] | None
+) -> ModelCard:
+    """The card of a `latentsafe_dreamer` policy."""
+    header = _header(dataset_repo_id, license, tags, "latentsafe_dreamer", "world-model")
+    repo_id = config.repo_id or "me/policy"
+    return ModelCard(TASK_POLICY_TEXT.format(header=header, task=config.task, dataset=dataset_repo_id, repo_id=repo_id))
+
+
+def _header(dataset_repo_id: str, license: str | None, tags: list[str] | None, name: str, kind: str) -> str:
+    return ModelCardData(
+        license=license or "apache-2.0",
+        library_name="lerobot",
+        pipeline_tag="robotics",
+        tags=sorted({*(tags or []), "robotics", "lerobot", name, kind}),
+        datasets=dataset_repo_id,
+        model_name=name,
+    ).to_yaml()
+
 
 CONFUSION = """## As a monitor, on held-out episodes
 
@@ -71,21 +112,13 @@ def make_model_card(
     config: LatentSafeConfig, dataset_repo_id: str, license: str | None, tags: list[str] | None
 ) -> ModelCard:
     """The card of a filter, from its configuration alone."""
-    data = ModelCardData(
-        license=license or "apache-2.0",
-        library_name="lerobot",
-        pipeline_tag="robotics",
-        tags=sorted({*(tags or []), "robotics", "lerobot", "latentsafe", "safety-filter"}),
-        datasets=dataset_repo_id,
-        model_name="latentsafe",
-    )
     actions = ", ".join(
         f"{name} in [{low:g}, {high:g}]"
         for name, low, high in zip(config.action_names or [], config.action_low or [], config.action_high or [])
     )
     return ModelCard(
         TEXT.format(
-            header=data.to_yaml(),
+            header=_header(dataset_repo_id, license, tags, "latentsafe", "safety-filter"),
             dataset=dataset_repo_id,
             robot=f"`{config.robot_type}`" if config.robot_type else "unknown",
             cameras=", ".join(f"`{c}` {tuple(config.input_features[c].shape)}" for c in config.cameras or []),
@@ -100,6 +133,7 @@ def make_model_card(
             calibration=_calibration(config.calibration),
             base=f"`{config.base_policy_path}`" if config.base_policy_path else "nothing yet",
             repo_id=config.repo_id or "me/filter",
+            imagination=_imagination(config.samples),
             confusion=_confusion(config.calibration),
             evaluation=_evaluation(config.evaluation),
         )
@@ -112,6 +146,12 @@ def _world_model(config: LatentSafeConfig) -> str:
         text += f", on {perception.components} components of the frozen encoder `{perception.encoder}`"
         text += f" (weights {perception.encoder_hash}), which is not part of the checkpoint"
     return text
+
+
+def _imagination(samples: int) -> str:
+    if not samples:
+        return "Imagination is deterministic: what is random in the world is foreseen as its mean."
+    return f"Imagination draws {samples} futures and believes the worst: what it did not draw is not foreseen."
 
 
 def _calibration(evidence: dict[str, float]) -> str:

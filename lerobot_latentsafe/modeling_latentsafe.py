@@ -20,9 +20,9 @@ from lerobot_latentsafe.datasets.frame_cache import to_model_images
 from lerobot_latentsafe.filter import FilterDecision, Reason
 from lerobot_latentsafe.margin import FailureMargin, hinge_loss
 from lerobot_latentsafe.memory import keep_freed_memory
-from lerobot_latentsafe.reachability import LatentImagination, SafetyCritic, look_ahead
+from lerobot_latentsafe.reachability import BACKUPS, LatentImagination, SafetyCritic, look_ahead, safety_bellman_target
 from lerobot_latentsafe.shield import BasePolicy, Shield
-from lerobot_latentsafe.world_models.base import Latent
+from lerobot_latentsafe.world_models.base import Clip, Latent
 
 logger = logging.getLogger(__name__)
 
@@ -72,7 +72,6 @@ class LatentSafePolicy(PreTrainedPolicy):
         kept = torch.tensor([name in config.kept_commands for name in config.action_names])
         self.register_buffer("kept", kept, persistent=False)
         self.critic = self.new_critic(candidates)
-        self.imagination = LatentImagination(self.world_model, self.margin, self.kept)
         self._ddp_params_and_buffers_to_ignore = self._never_averaged()
         self._base: list[BasePolicy] = []  # in a list, so that its weights are not ours
         self.shield = Shield(self)
@@ -88,7 +87,13 @@ class LatentSafePolicy(PreTrainedPolicy):
         low = torch.tensor(low) if low else -torch.ones(len(moves))
         high = torch.tensor(high) if high else torch.ones(len(moves))
         sizes = self.world_model.feature_dim, len(moves), candidates, self.config.reachability
-        return SafetyCritic(*sizes, low.to(moves.device) * moves, high.to(moves.device) * moves).to(moves.device)
+        bounds = low.to(moves.device) * moves, high.to(moves.device) * moves
+        return SafetyCritic(*sizes, *bounds, self.config.target).to(moves.device)
+
+    @property
+    def imagination(self) -> LatentImagination:
+        """World model and margin, as reachability sees them."""
+        return LatentImagination(self.world_model, self.margin, self.kept, self.config.samples > 0)
 
     # -- units ---
 
@@ -155,7 +160,11 @@ class LatentSafePolicy(PreTrainedPolicy):
             )
         if self.device.type == "cpu":
             keep_freed_memory()
-        clip = self.reader.read(batch, self)
+        loss, _, metrics = self.clip_loss(self.reader.read(batch, self))
+        return loss, metrics
+
+    def clip_loss(self, clip: Clip) -> tuple[Tensor, Tensor, dict[str, float]]:
+        """The loss of a clip, the features (B, T, D) of its frames, and metrics."""
         loss, features, metrics = self.world_model.loss(clip)
         margin = self.margin(features)
         failure = torch.where(clip.valid, clip.failure, -1)
@@ -165,7 +174,8 @@ class LatentSafePolicy(PreTrainedPolicy):
         correct = ((margin < 0) == (failure == 1))[labelled].float().mean()
         if self.training:
             self.config.stage = STAGES[1]
-        return loss, {**metrics, "loss_margin": margin_loss.item(), "margin_accuracy": correct.item()}
+        metrics |= {"loss_margin": margin_loss.item(), "margin_accuracy": correct.item()}
+        return loss, features, metrics
 
     def value(self, latent: Latent) -> Tensor:
         """V(z) of latents (B, ...) -> (B,); see `plan`."""
@@ -182,13 +192,17 @@ class LatentSafePolicy(PreTrainedPolicy):
         if self.config.law == "margin":
             margin = self.imagination.margin(latent)
             return margin, self.imagination.complete(latent, still.expand(len(margin), -1))
-        critic = self.critic if self.config.law == "reachability" else None
+        critic = self.critic if self.config.law in BACKUPS else None
         return look_ahead(self.imagination, latent, self.critic.held_actions(still), self.config.lookahead, critic)
 
     @property
     def needed_stage(self) -> str:
         """How far training must have come for this law to decide."""
-        return "reachability" if self.config.law == "reachability" else "world_model"
+        return "reachability" if self.config.law in BACKUPS else "world_model"
+
+    def worst(self, margin: Tensor, value: Tensor) -> Tensor:
+        """The value of going through a margin l to a latent of some value, all (...,): Eq. 5 undiscounted."""
+        return BACKUPS.get(self.config.law, safety_bellman_target)(margin, value, 1.0)
 
     # -- deployment ---
 
@@ -205,6 +219,10 @@ class LatentSafePolicy(PreTrainedPolicy):
                 f"base policy {path} acts in {getattr(theirs, 'shape', None)}, the filter in {own.shape} "
                 f"({', '.join(self.config.action_names or [])}); they must share one action space"
             )
+        for name in ("task", "fps", "action_names"):  # a policy with a world model says what that is of
+            known, wanted = getattr(self.config, name), getattr(base.config, name, None)
+            if known is not None and wanted is not None and known != wanted:
+                raise ValueError(f"base policy {path} has {name} = {wanted}, the filter {known}; they must agree")
         self.config.input_features = {**base.config.input_features, **self.config.input_features}
         self.config.base_policy_path = str(path)
         self._base = [base]
@@ -235,7 +253,7 @@ class LatentSafePolicy(PreTrainedPolicy):
             proposed = None
         decision = self.shield(batch, proposed, age_s)
         if decision.intervened.any():
-            self.base.replan()
+            self.base.replan(decision.action)
         return decision
 
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
@@ -243,7 +261,8 @@ class LatentSafePolicy(PreTrainedPolicy):
         return self.select_action(batch).unsqueeze(1)
 
     def require_stage(self, stage: str) -> None:
-        """Raise unless training has come at least this far."""
+        """Raise unless training has come at least this far, and the critic says what the law reads."""
+        self.config.require_critic_of_law()
         if STAGES.index(self.config.stage) < STAGES.index(stage):
             part, command = {
                 "world_model": ("world model", "lerobot-train --policy.type=latentsafe"),

@@ -8,7 +8,7 @@ In a single process all of this does nothing.
 """
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import torch
@@ -62,10 +62,17 @@ def from_first_rank(x: Tensor) -> Tensor:
 
 def randn_like(x: Tensor) -> Tensor:
     """This rank's share of standard normal noise for the batches (B, ...) of all ranks, which share a seed."""
-    if world_size() == 1:
-        return torch.randn_like(x)
+    return torch.randn_like(x) if world_size() == 1 else _share_of_all(torch.randn, x)
+
+
+def rand_like(x: Tensor) -> Tensor:
+    """The same, uniform in [0, 1)."""
+    return torch.rand_like(x) if world_size() == 1 else _share_of_all(torch.rand, x)
+
+
+def _share_of_all(draw: Callable[..., Tensor], x: Tensor) -> Tensor:
     n = len(x)
-    noise = torch.randn(world_size() * n, *x.shape[1:], dtype=x.dtype, device=x.device)
+    noise = draw(world_size() * n, *x.shape[1:], dtype=x.dtype, device=x.device)
     return noise[rank() * n : (rank() + 1) * n]
 
 

@@ -26,7 +26,13 @@ share of the batch (see `ranks.py`)."""
 
 
 class Imagination(Protocol):
-    """What reachability needs to know of the world; latents are batch-first structures of tensors."""
+    """What reachability needs to know of the world; latents are batch-first structures of tensors.
+
+    Attributes:
+        sampled: whether `step` draws one of several futures, so that what came of an action once need not come again.
+    """
+
+    sampled: bool
 
     def step(self, latent: Latent, action: Tensor) -> Latent:
         """Next latent under actions (B, A) in [-1, 1]."""
@@ -49,13 +55,15 @@ class LatentImagination:
 
     Args:
         kept: bool (A,), commands that a fallback keeps as they were, such as a gripper's.
+        sampled: draw what comes next from the world model's distribution, instead of its mean or mode.
     """
 
-    def __init__(self, world_model: WorldModel, margin: FailureMargin, kept: Tensor):
-        self.world_model, self.failure_margin, self.kept = world_model, margin, kept
+    def __init__(self, world_model: WorldModel, margin: FailureMargin, kept: Tensor, sampled: bool = False):
+        self.world_model, self.failure_margin, self.kept, self.sampled = world_model, margin, kept, sampled
 
     def step(self, latent: Latent, action: Tensor) -> Latent:
-        return self.world_model.step(latent, action)
+        step = self.world_model.sample_step if self.sampled else self.world_model.step
+        return step(latent, action)
 
     def features(self, latent: Latent) -> Tensor:
         return self.world_model.features(latent)
@@ -76,6 +84,21 @@ def safety_bellman_target(margin: Tensor, next_value: Tensor, gamma: float) -> T
     gamma = 0 gives the margin itself, gamma -> 1 the undiscounted minimum over time.
     """
     return (1 - gamma) * margin + gamma * torch.minimum(margin, next_value)
+
+
+def risk_bellman_target(margin: Tensor, next_value: Tensor, gamma: float) -> Tensor:
+    """SQRL's backup for V = -risk: -(c + (1 - c) gamma risk'), where c is 1 in failures (l < 0), else 0.
+
+    The risk is the discounted probability of failing; a value above 0, such as infinity, says that none is ahead.
+    """
+    return torch.where(margin >= 0, gamma * next_value.clamp(-1, 0), -1.0)  # what is no number has failed
+
+
+BACKUPS: dict[str, Callable[[Tensor, Tensor, float], Tensor]] = {
+    "reachability": safety_bellman_target,
+    "risk": risk_bellman_target,
+}
+"""What a critic can be trained for: (margin, next value, gamma) -> value, all but gamma of one shape."""
 
 
 @dataclass
@@ -150,6 +173,7 @@ class SafetyCritic(nn.Module):
         action_dim: A.
         candidates: (K, A) in [-1, 1], the discrete action set, or None for continuous actions.
         low, high: (A,) in [-1, 1], the range of a continuous policy's commands; by default all of it.
+        target: which of `BACKUPS` the values obey.
     """
 
     def __init__(
@@ -160,8 +184,10 @@ class SafetyCritic(nn.Module):
         config: ReachabilityConfig,
         low: Tensor | None = None,
         high: Tensor | None = None,
+        target: str = "reachability",
     ):
         super().__init__()
+        self.backup = BACKUPS[target]
         n_components = min(config.components, feature_dim)
         self.register_buffer("feature_mean", torch.zeros(feature_dim))
         self.register_buffer("projection", torch.eye(feature_dim, n_components))
@@ -221,8 +247,8 @@ class SafetyCritic(nn.Module):
         return self.between(torch.sigmoid(2 * self.actor(x)))
 
     def value(self, features: Tensor, margin: Tensor) -> Tensor:
-        """V = min(l, max_a Q) at raw features (..., D) with bounded margin (...,)."""
-        return torch.minimum(margin, self.best_q(self.project(features)))
+        """V = min(l, max_a Q) at raw features (..., D) with bounded margin (...,); a risk's is -1 where l < 0."""
+        return self.backup(margin, self.best_q(self.project(features)), 1.0)
 
     def fallback(self, features: Tensor) -> Tensor:
         """Safety-preserving action in [-1, 1] at raw features: (..., D) -> (..., A)."""
@@ -477,7 +503,9 @@ class LatentReachability:
             future = self.target.q(x).gather(-1, choice).squeeze(-1)
         else:
             future = self.target.best_q(x)
-        target = torch.where(ended, l, safety_bellman_target(l, future, gamma))
+        target = self.critic.backup(l, torch.where(ended, torch.inf, future), gamma)
+        if self.imagination.sampled or self.critic.backup is not safety_bellman_target:
+            return target  # what was achieved once bounds neither what is drawn again nor a probability
         beyond = torch.where(batch["end_over"], torch.inf, self.target.best_q(batch["end_x"]))
         achieved = torch.minimum(batch["worst"], beyond)[:, None]
         taken = batch["choice"][:, None]

@@ -18,7 +18,7 @@ from torch import Tensor
 from lerobot_latentsafe.checkpoint import TRAINED
 from lerobot_latentsafe.datasets.frame_cache import check_proportions
 from lerobot_latentsafe.filter import FilterDecision, Reason, least_restrictive
-from lerobot_latentsafe.world_models.base import Latent, replace_rows
+from lerobot_latentsafe.world_models.base import Latent, map_latent, replace_rows
 
 if TYPE_CHECKING:
     from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
@@ -80,10 +80,12 @@ class Shield:
         margin = model.imagination.margin(latent)
         predicted, on_the_way = self._go_on(latent, inputs)
         both = {key: torch.cat([predicted[key], latent[key]]) for key in latent}  # one pass through imagination
-        (value, here), (_, action) = (part.split(len(state)) for part in model.plan(both))
+        sizes = [len(on_the_way), len(state)]
+        (value, here), (_, action) = (part.split(sizes) for part in model.plan(both))
         fallback = self._usable(action, here, state)
         # A margin that is negative now, or on the way, is a failure whatever comes after.
-        value = torch.minimum(value, torch.minimum(margin, on_the_way))
+        value = model.worst(on_the_way, value).view(-1, len(state)).amin(0)
+        value = model.worst(margin, value)
         finished = self.clock()
         if config.deadline_ms is not None and (finished - started) * 1e3 > config.deadline_ms:
             fault = _first_fault(fault, torch.ones_like(fault, dtype=torch.bool), Reason.DEADLINE_MISSED)
@@ -114,7 +116,9 @@ class Shield:
     def _no_stricter_than(self, other: "Shield") -> bool:
         """Whether the other has our weights, acts, and passes nothing that we would not."""
         own, theirs = self.filter.config, other.filter.config
-        same = all(getattr(own, name) == getattr(theirs, name) for name in (*TRAINED, "law", "lookahead", "guard"))
+        same = all(
+            getattr(own, name) == getattr(theirs, name) for name in (*TRAINED, "law", "lookahead", "guard", "samples")
+        )
         if not same or theirs.mode == "monitor" or theirs.epsilon < own.epsilon:
             return False
         if other not in self._twins:  # weights are compared once
@@ -195,9 +199,16 @@ class Shield:
         return replace_rows(seen, predicted, where=blind)
 
     def _go_on(self, latent: Latent, action: Tensor) -> tuple[Latent, Tensor]:
-        """The latent after `guard` steps of the action (B, A), and the least margin until there (B,)."""
-        imagination, least = self.filter.imagination, torch.full_like(action[:, 0], torch.inf)
-        for _ in range(self.filter.config.guard):
+        """N x B latents after `guard` steps of the action (B, A), and the least margin until there (N x B,).
+
+        N is 1, or the number of samples that are drawn of each robot's future.
+        """
+        model, config = self.filter, self.filter.config
+        n = max(1, config.samples)
+        imagination, action = model.imagination, action.repeat(n, 1)
+        latent = map_latent(latent, lambda t: t.repeat(n, *[1] * (t.dim() - 1)))
+        least = torch.full_like(action[:, 0], torch.inf)
+        for _ in range(config.guard):
             latent = imagination.step(latent, action)
             least = torch.minimum(least, imagination.margin(latent))
         return latent, least
@@ -264,8 +275,14 @@ class BasePolicy:
         """Action (B, A) in robot units, through the base policy's own processors."""
         return self.postprocessor(self.policy.select_action(self.preprocessor(dict(observation))))
 
-    def replan(self) -> None:
-        """Drop the rest of a planned chunk: after an intervention it belongs to a state that never came."""
+    def replan(self, executed: Tensor) -> None:
+        """Drop the rest of a planned chunk: after an intervention it belongs to a state that never came.
+
+        A policy that remembers its actions, and says so by a method `was_overridden`, is told what was done instead:
+        (B, A) in robot units.
+        """
+        if hasattr(self.policy, "was_overridden"):
+            return self.policy.was_overridden(executed)
         queues = getattr(self.policy, "_queues", None)
         if isinstance(queues, dict) and "action" in queues:
             queues["action"].clear()

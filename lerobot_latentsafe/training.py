@@ -5,9 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor
 
-from lerobot_latentsafe.checkpoint import WEIGHTS, seal
+from lerobot_latentsafe.checkpoint import INTEGRITY, WEIGHTS, seal
 from lerobot_latentsafe.datasets.clips import ClipReader
 from lerobot_latentsafe.margin import FailureMargin, hinge_loss
 from lerobot_latentsafe.memory import keep_freed_memory
@@ -169,9 +170,13 @@ def covered_actions(policy: LatentSafePolicy, reader: ClipReader, coverage: floa
 
 
 def train_reachability(
-    path: str | Path, dataset_meta, output_dir: Path, seed: int = 0, steps: int | None = None
-) -> LatentSafePolicy:
+    path: str | Path, dataset_meta, output_dir: Path, seed: int = 0, steps: int | None = None,
+    target: str = "reachability",
+) -> LatentSafePolicy:  # fmt: skip
     """Load a stage-1 checkpoint, learn its safety critic, save the filter.
+
+    Args:
+        target: what the critic learns: the safety value of Eq. 5, or the `risk` of SQRL.
 
     Several ranks share the work (see `LatentReachability`); the first one saves.
 
@@ -186,6 +191,10 @@ def train_reachability(
     if policy.device.type == "cpu":
         keep_freed_memory()
     config = policy.config.reachability
+    policy.config.target = policy.config.law = target
+    if target == "risk":
+        policy.config.lookahead = 0
+    policy.config.require_critic_of_law()
     if steps is not None:
         config.steps = steps
     generator = torch.Generator(device="cpu").manual_seed(seed)
@@ -217,22 +226,23 @@ def refuse_existing(output_dir: str | Path) -> None:
         raise FileExistsError(f"{output_dir} holds a checkpoint already; choose another --output_dir")
 
 
-def save_filter(policy: LatentSafePolicy, output_dir: Path, half: bool = False) -> None:
-    """Write a filter with the processors LeRobot's commands expect beside it; `half` stores 16-bit weights."""
-    from lerobot_latentsafe.processor_latentsafe import make_latentsafe_pre_post_processors
+def save_filter(policy: PreTrainedPolicy, output_dir: Path, half: bool = False) -> None:
+    """Write a filter, or a task policy, with the processors LeRobot's commands expect; `half` stores 16-bit weights."""
+    from lerobot.policies.factory import make_pre_post_processors
 
     policy.save_pretrained(output_dir)
     if half:
         halve_weights(output_dir)
-    for pipeline in make_latentsafe_pre_post_processors(policy.config):
+    for pipeline in make_pre_post_processors(policy.config):
         pipeline.save_pretrained(output_dir)
 
 
 def halve_weights(folder: Path) -> None:
-    """Rewrite every model.safetensors below a folder in 16 bits, and seal the filter's again."""
+    """Rewrite every model.safetensors below a folder in 16 bits, and seal those of filters again."""
     from safetensors.torch import load_file, save_file
 
     for file in Path(folder).rglob(WEIGHTS):
         tensors = {k: v.half() if v.is_floating_point() else v for k, v in load_file(file).items()}
         save_file(tensors, file, metadata={"format": "pt"})
-    seal(Path(folder))
+        if (file.parent / INTEGRITY).exists():
+            seal(file.parent)

@@ -104,6 +104,17 @@ def tiny_diffusion(tmp_path_factory):
     return tiny.save_diffusion(tmp_path_factory.mktemp("diffusion"))
 
 
+@pytest.fixture(scope="session")
+def tiny_dreamer(tmp_path_factory):
+    """Output folder of a run of train-dreamer that was never interrupted."""
+    from lerobot_latentsafe.baselines.dreamer.training import DreamerTraining
+
+    folder = tmp_path_factory.mktemp("dreamer") / "run"
+    with tiny.short_blocks():
+        DreamerTraining(tiny.dreamer_options(folder)).run()
+    return folder
+
+
 @pytest.fixture
 def policy(tiny_filter):
     """The tiny filter, loaded afresh."""

@@ -347,7 +347,7 @@ def test_policy_without_a_known_queue_is_reset_to_replan(shielded, monkeypatch):
     calls = []
     monkeypatch.setattr(shielded.base.policy, "_queues", None)
     monkeypatch.setattr(shielded.base.policy, "reset", lambda: calls.append("reset"))
-    shielded.base.replan()
+    shielded.base.replan(torch.zeros(2, tiny.ACTION_DIM))
     assert calls == ["reset"]
 
 

@@ -30,7 +30,7 @@ class WindyChain:
     So exactly the states with x >= 0.4 can be kept safe, by not moving left.
     """
 
-    threshold = 0.4
+    threshold, sampled = 0.4, False
 
     def step(self, latent, action):
         x = latent["x"]

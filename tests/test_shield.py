@@ -367,5 +367,5 @@ def test_baseline_laws_need_no_critic(tiny_world_model, law):
 
 
 def test_unknown_law_is_refused():
-    with pytest.raises(ValueError, match=r"law is 'luck'; expected one of reachability, plan, margin"):
+    with pytest.raises(ValueError, match=r"law is 'luck'; expected one of reachability, risk, plan, margin"):
         tiny.config(law="luck")

@@ -1,10 +1,13 @@
 """Small things that tests build: configurations, batches, policies."""
 
+import dataclasses
 import json
 import shutil
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 from lerobot_latentsafe import LatentSafeConfig
@@ -218,3 +221,38 @@ def rewrite_json(path, **changes):
     """Set top-level entries of a JSON file."""
     path = Path(path)
     path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+
+
+BLOCKS_FRAMES = 12
+
+
+@contextmanager
+def short_blocks():
+    """Meanwhile episodes of the blocks have 12 frames, and the red blocks seem to fall after a quarter of a second."""
+    from lerobot_latentsafe.envs import blocks
+    from lerobot_latentsafe.envs.scenes import SCENES
+
+    info = dataclasses.replace(SCENES["blocks"], episode_seconds=BLOCKS_FRAMES / SCENES["blocks"].fps)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(SCENES, "blocks", info)
+        patch.setattr(blocks.BlocksScene, "tilts", lambda self: np.full(2, 4 * self.data.time))
+        yield
+
+
+def dreamer_options(output_dir, **changes):
+    """A run of `latentsafe train-dreamer` in seconds: two demonstrations, two rounds of two episodes."""
+    from lerobot_latentsafe import LatentSafeDreamerConfig
+    from lerobot_latentsafe.baselines.dreamer.behavior import BehaviorConfig
+    from lerobot_latentsafe.baselines.dreamer.training import TrainDreamer
+
+    behavior = BehaviorConfig(hidden=16, bins=17, horizon=3, starts=8)
+    model = config(
+        world_model=rssm_config(image_size=16, classes=4, clip_length=6), action_candidates=None, lookahead=0,
+        kept_commands=["gripper.pos"], margin_layers=3,
+    )  # fmt: skip
+    policy = LatentSafeDreamerConfig(behavior=behavior, device="cpu", push_to_hub=False)
+    options = dict(
+        policy=policy, model=model, demonstrations=2, pretraining=3, steps=7, collect_every=2, n_envs=2, batch_size=4,
+        save_every=2, log_every=1,
+    )  # fmt: skip
+    return TrainDreamer(output_dir=output_dir, **{**options, **changes})

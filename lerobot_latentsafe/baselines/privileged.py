@@ -13,6 +13,8 @@ from lerobot_latentsafe.world_models.base import Latent
 class DubinsImagination:
     """The car itself behind the `Imagination` protocol; a latent is {"state": (B, 3)}."""
 
+    sampled = False
+
     def __init__(self, half_width: float = dubins.VIEW):
         self.half_width = half_width
 

@@ -29,6 +29,7 @@ from lerobot_latentsafe.datasets.frame_cache import (
 )
 
 if TYPE_CHECKING:
+    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     from lerobot_latentsafe.labeling.frames import DatasetFrames
@@ -265,21 +266,30 @@ def _await_layout(dataset: "LeRobotDataset", folder: Path, kept: Recipe, patienc
 
 
 def _finish(dataset: "LeRobotDataset", output_dir: Path, kept: Recipe) -> FrameCache:
-    """Write the manifest, which makes it a cache."""
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
-    meta = dataset.meta
+    cameras = {key: list(dataset.meta.features[key]["shape"]) for key in dataset.meta.camera_keys}
+    write_manifest(output_dir, dataset.meta, cameras, kept.manifest)
+    return FrameCache.open(output_dir, LeRobotDatasetMetadata(f"{dataset.repo_id}_cache", root=output_dir))
+
+
+def write_manifest(root: Path, meta: "LeRobotDatasetMetadata", cameras: dict[str, list[int]], percepts: dict) -> None:
+    """Note what the arrays in a dataset's frame cache are of, which makes them a cache.
+
+    Args:
+        cameras: key -> (height, width, channels) of what was seen.
+        percepts: what the recipe notes: image_size, percepts, and more.
+    """
     manifest = {
         "version": VERSION,
-        "repo_id": dataset.repo_id,
+        "repo_id": meta.repo_id,
         "fingerprint": dataset_fingerprint(meta),
-        "n_frames": dataset.num_frames,
-        "fps": dataset.fps,
-        "cameras": {key: list(meta.features[key]["shape"]) for key in meta.camera_keys},
-        **kept.manifest,
+        "n_frames": meta.total_frames,
+        "fps": meta.fps,
+        "cameras": cameras,
+        **percepts,
     }
-    _write(output_dir / FOLDER / MANIFEST, manifest)
-    return FrameCache.open(output_dir, LeRobotDatasetMetadata(f"{dataset.repo_id}_cache", root=output_dir))
+    _write(root / FOLDER / MANIFEST, manifest)
 
 
 def _write(file: Path, content: object) -> None:

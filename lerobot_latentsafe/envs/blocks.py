@@ -23,7 +23,9 @@ NAMES = ("green", "red_left", "red_right")
 
 
 class BlocksScene(FrankaScene):
-    """Pluck the green block. Truth: tilt of the red blocks, whether one fell, whether the green one is lifted.
+    """Pluck the green block. Truth: tilt of the red blocks, whether one fell, whether the green one is lifted, and what
+    dense rewards are made of: `reach` in [0, 1], how near the fingers are to the green block's top, and `joint_speed`,
+    the sum of squares over the arm's joints, rad^2/s^2.
 
     Args:
         variant: standard.
@@ -71,14 +73,16 @@ class BlocksScene(FrankaScene):
         green = self.block_position("green")
         lifted = bool(green[2] > LIFTED)
         distance = float(np.linalg.norm(self.tool_pose()[0] - green - [0, 0, 0.8 * HALF_HEIGHT]))
-        speed = float(np.square(self.data.qvel[:7]).sum())
+        reach, joint_speed = float(1 - np.tanh(distance / 0.1)), float(np.square(self.data.qvel[:7]).sum())
         return {
             "margin": MAX_TILT - tilt,
             "failure": fallen,
             "is_success": lifted and not fallen,
             "tilt": tilt,
             "lifted": lifted,
-            "reward": 1 - np.tanh(distance / 0.1) + 20 * lifted - 10 * fallen - 1e-3 * speed,
+            "reach": reach,
+            "joint_speed": joint_speed,
+            "reward": reach + 20 * lifted - 10 * fallen - 1e-3 * joint_speed,
         }
 
 

@@ -113,7 +113,8 @@ def _run_batch(
     task = vector_env.call("task_description")
     actor.reset()
     observation, info = vector_env.reset(seed=seeds)
-    runs, done = _begun(info, vector_env.call("render")[:n_videos]), np.zeros(len(seeds), bool)
+    render = lambda: vector_env.call("render")[:n_videos] if n_videos else []  # noqa: E731
+    runs, done = _begun(info, render()), np.zeros(len(seeds), bool)
     while not done.all():
         batch = {**preprocess_observation(observation), "task": list(task)}
         alive, filmed = ~done, np.flatnonzero(~done[:n_videos])
@@ -132,7 +133,7 @@ def _run_batch(
         for i in np.flatnonzero(alive):
             _note_outcome(runs, i, final if over[i] else info)
         _record(runs.traces, alive, action=torch.from_numpy(action))
-        pictures = vector_env.call("render")[:n_videos]
+        pictures = render()
         for i in filmed[~over[filmed]]:
             runs.frames[i].append(pictures[i])
         done |= over

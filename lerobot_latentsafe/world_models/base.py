@@ -105,6 +105,10 @@ class WorldModel(nn.Module, abc.ABC):
     def step(self, latent: Latent, action: Tensor) -> Latent:
         """Imagine: next latent (B, ...) under actions (B, A) in [-1, 1]."""
 
+    def sample_step(self, latent: Latent, action: Tensor) -> Latent:
+        """One of the latents that may come next; a model that knows only one takes that."""
+        return self.step(latent, action)
+
     @property
     def percept_names(self) -> list[str]:
         """Keys of what `perceive` returns."""

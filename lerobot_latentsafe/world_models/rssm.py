@@ -1,8 +1,8 @@
-"""Recurrent state-space model with a Gaussian latent (Hafner et al., 2019), the paper's model in simulation.
+"""Recurrent state-space model (Hafner et al., 2019; DreamerV3), the paper's model in simulation.
 
-z_t = (h_t, x_t): h_t = GRU(h_{t-1}, x_{t-1}, a_{t-1}) is deterministic, x_t is Gaussian with a prior p(x_t | h_t)
-and a posterior q(x_t | h_t, o_t). Training reconstructs images and proprioception and pulls prior and posterior
-together. Imagination and filtering carry means, so they are deterministic.
+z_t = (h_t, x_t): h_t = GRU(h_{t-1}, x_{t-1}, a_{t-1}) is deterministic, x_t is Gaussian or categorical with a prior
+p(x_t | h_t) and a posterior q(x_t | h_t, o_t). Training reconstructs images and proprioception and pulls prior and
+posterior together. Filtering and `step` carry means or modes, so they are deterministic; `sample_step` samples.
 """
 
 from dataclasses import dataclass
@@ -12,9 +12,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from lerobot_latentsafe.ranks import mean_over_ranks, randn_like
+from lerobot_latentsafe.ranks import mean_over_ranks
 from lerobot_latentsafe.world_models.base import Clip, Latent, WorldModelConfig
 from lerobot_latentsafe.world_models.ends import EndAware
+from lerobot_latentsafe.world_models.stochastic import Categorical, Gaussian, Statistics
 
 
 @WorldModelConfig.register_subclass("rssm")
@@ -24,6 +25,9 @@ class RSSMConfig(WorldModelConfig):
 
     Attributes:
         deterministic, stochastic, hidden: sizes of h, x and of the layers between them.
+        classes: 0: x is `stochastic` Gaussians; else `stochastic` categoricals of so many classes (32 of 32 in the
+            paper's manipulation).
+        unimix: share of a categorical's probability that is uniform.
         encoder: `mlp` reads small images flat; `cnn` is DreamerV3's strided network down to 4 x 4.
         cnn_depth: channels of the first of the CNN's layers, doubled at each.
         units, image_layers: width and depth of the MLP image encoder and decoder.
@@ -39,6 +43,8 @@ class RSSMConfig(WorldModelConfig):
     deterministic: int = 256
     stochastic: int = 32
     hidden: int = 256
+    classes: int = 0
+    unimix: float = 0.01
     encoder: str = "mlp"
     cnn_depth: int = 32
     units: int = 240
@@ -62,7 +68,8 @@ class _ChannelNorm(nn.LayerNorm):
         return super().forward(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 
 
-def _mlp(n_in: int, units: int, n_layers: int) -> nn.Sequential:
+def mlp(n_in: int, units: int, n_layers: int) -> nn.Sequential:
+    """Layers of DreamerV3: linear, normalised, SiLU."""
     layers: list[nn.Module] = []
     for i in range(n_layers):
         layers += [nn.Linear(n_in if i == 0 else units, units, bias=False), nn.LayerNorm(units), nn.SiLU()]
@@ -85,7 +92,7 @@ class _ImageEncoder(nn.Module):
         if config.encoder == "mlp":
             self.dim = config.units
             pixels = 3 * config.image_size**2
-            self.net = nn.Sequential(nn.Flatten(), _mlp(pixels, config.units, config.image_layers))
+            self.net = nn.Sequential(nn.Flatten(), mlp(pixels, config.units, config.image_layers))
             return
         channels = _cnn_channels(config)
         layers: list[nn.Module] = []
@@ -107,7 +114,7 @@ class _ImageDecoder(nn.Module):
         self.flat = config.encoder == "mlp"
         if self.flat:
             last = nn.Linear(config.units, 3 * config.image_size**2)
-            self.net = nn.Sequential(_mlp(feature_dim, config.units, config.image_layers), last)
+            self.net = nn.Sequential(mlp(feature_dim, config.units, config.image_layers), last)
         else:
             channels = _cnn_channels(config)[::-1]
             self.channels = channels[0]
@@ -134,7 +141,7 @@ class _ImageDecoder(nn.Module):
 
 
 class RSSM(EndAware):
-    """See the module's text. Latent: h (B, H), mean and std of x (B, S), and the x (B, S) carried on."""
+    """See the module's text. Latent: h (B, H) and x (B, X), flat one-hot vectors where it is categorical."""
 
     def __init__(self, config: RSSMConfig, image_keys: list[str], state_dim: int, action_dim: int):
         super().__init__()
@@ -142,8 +149,14 @@ class RSSM(EndAware):
             raise ValueError("an RSSM needs at least one camera, got none; record observation.image* features")
         if config.encoder not in ("mlp", "cnn"):
             raise ValueError(f"encoder is {config.encoder!r}; expected 'mlp' or 'cnn'")
+        if config.classes < 0 or config.classes == 1:
+            raise ValueError(f"classes is {config.classes}; expected 0 (Gaussian) or at least 2")
         self.config, self.image_keys, self.action_dim = config, sorted(image_keys), action_dim
-        h, x, hidden = config.deterministic, config.stochastic, config.hidden
+        if config.classes:
+            self.stochastic = Categorical(config.stochastic, config.classes, config.unimix)
+        else:
+            self.stochastic = Gaussian(config.stochastic, config.min_std)
+        h, x, hidden = config.deterministic, self.stochastic.dim, config.hidden
         self.feature_dim = h + x
         # Module names must not hold dots, dataset keys do.
         self.cameras = {key: key.replace(".", "_") for key in self.image_keys}
@@ -153,9 +166,9 @@ class RSSM(EndAware):
         for name in self.cameras.values():
             self.register_buffer(f"mean_{name}", torch.zeros(shape))
         self.register_buffer("mean_count", torch.zeros(()))
-        self.state_encoder = _mlp(state_dim, config.state_units, config.state_layers)
+        self.state_encoder = mlp(state_dim, config.state_units, config.state_layers)
         self.state_decoder = nn.Sequential(
-            _mlp(self.feature_dim, config.state_units, config.state_layers),
+            mlp(self.feature_dim, config.state_units, config.state_layers),
             nn.Linear(config.state_units, state_dim),
         )
         embedding = sum(e.dim for e in self.encoders.values()) + config.state_units
@@ -165,30 +178,41 @@ class RSSM(EndAware):
         self.gru = nn.Linear(hidden + h, 3 * h, bias=False)
         self.gru_norm = nn.LayerNorm(3 * h, eps=1e-3)
         self.prior_in, self.prior_norm = nn.Linear(h, hidden, bias=False), nn.LayerNorm(hidden, eps=1e-3)
-        self.prior_out = nn.Linear(hidden, 2 * x)
+        self.prior_out = nn.Linear(hidden, self.stochastic.n_raw)
         self.posterior_in, self.posterior_norm = (
             nn.Linear(h, hidden, bias=False),
             nn.LayerNorm(hidden, eps=1e-3),
         )
-        self.posterior_out = nn.Linear(hidden, 2 * x)
+        self.posterior_out = nn.Linear(hidden, self.stochastic.n_raw)
         self.h0 = nn.Parameter(torch.zeros(h))
-        self.continues = nn.Sequential(_mlp(self.feature_dim, config.state_units, 1), nn.Linear(config.state_units, 1))
+        self.continues = nn.Sequential(mlp(self.feature_dim, config.state_units, 1), nn.Linear(config.state_units, 1))
 
     # -- the model ---
 
     def initial(self, batch_size: int) -> Latent:
         h = torch.tanh(self.h0).expand(batch_size, -1)
-        return {**self._with_prior(h), "action": h.new_zeros(batch_size, self.action_dim)}
+        action = h.new_zeros(batch_size, self.action_dim)
+        return {"h": h, "x": self.stochastic.centre(self._prior(h)), "action": action}
 
     def step(self, latent: Latent, action: Tensor) -> Latent:
-        return {**self._with_prior(self._recur(latent["h"], latent["x"], action)), "action": action}
+        h = self._recur(latent["h"], latent["x"], action)
+        return {"h": h, "x": self.stochastic.centre(self._prior(h)), "action": action}
+
+    def sample_step(self, latent: Latent, action: Tensor) -> Latent:
+        h = self._recur(latent["h"], latent["x"], action)
+        return {"h": h, "x": self.stochastic.sample(self._prior(h)), "action": action}
 
     def correct(self, predicted: Latent, percepts: dict[str, Tensor], state: Tensor) -> Latent:
-        mean, std = self._posterior(predicted["h"], self.embed(percepts, state))
-        return {**predicted, "x": mean, "std": std}
+        posterior = self._posterior(predicted["h"], self.embed(percepts, state))
+        return {**predicted, "x": self.stochastic.centre(posterior)}
 
     def features(self, latent: Latent) -> Tensor:
         return torch.cat([latent["x"], latent["h"]], -1)
+
+    def latent_of(self, features: Tensor, action: Tensor) -> Latent:
+        """The latent with these features (N, D), led to by actions (N, A)."""
+        x, h = features.split([self.stochastic.dim, self.config.deterministic], -1)
+        return {"h": h, "x": x, "action": action}
 
     def error(self, latent: Latent, percepts: dict[str, Tensor], state: Tensor) -> Tensor:
         decoded = self.decode(self.features(latent))
@@ -211,19 +235,12 @@ class RSSM(EndAware):
         # The bias of -1 makes a fresh cell remember, as in DreamerV3.
         return torch.lerp(h, torch.tanh(torch.sigmoid(reset) * candidate), torch.sigmoid(update - 1))
 
-    def _gaussian(self, raw: Tensor) -> tuple[Tensor, Tensor]:
-        mean, std = raw.chunk(2, -1)
-        return mean, 2 * torch.sigmoid(std / 2) + self.config.min_std
+    def _prior(self, h: Tensor) -> Statistics:
+        return self.stochastic.read(self.prior_out(F.silu(self.prior_norm(self.prior_in(h)))))
 
-    def _prior(self, h: Tensor) -> tuple[Tensor, Tensor]:
-        return self._gaussian(self.prior_out(F.silu(self.prior_norm(self.prior_in(h)))))
-
-    def _posterior(self, h: Tensor, embedding: Tensor) -> tuple[Tensor, Tensor]:
-        return self._gaussian(self.posterior_out(F.silu(self.posterior_norm(self.posterior_in(h) + embedding))))
-
-    def _with_prior(self, h: Tensor) -> Latent:
-        mean, std = self._prior(h)
-        return {"h": h, "x": mean, "std": std}
+    def _posterior(self, h: Tensor, embedding: Tensor) -> Statistics:
+        u = F.silu(self.posterior_norm(self.posterior_in(h) + embedding))
+        return self.stochastic.read(self.posterior_out(u))
 
     def _centred(self, key: str, images: dict[str, Tensor]) -> Tensor:
         return images[key] - getattr(self, f"mean_{self.cameras[key]}")
@@ -237,12 +254,12 @@ class RSSM(EndAware):
         batch, length = clip.state.shape[:2]
         images = {key: value.flatten(0, 1) for key, value in clip.percepts.items()}
         embedding = self.embed(images, clip.state.flatten(0, 1)).unflatten(0, (batch, length))
-        h, x, mean, std = self._filter_sampled(embedding, clip)
+        h, x, *posterior = self._filter_sampled(embedding, clip)
         features = torch.cat([x, h], -1)
         weight = clip.valid.float()
         weight = weight / mean_over_ranks(weight.sum()).clamp(min=1)
 
-        kl_dynamics, kl_representation, kl = self._balanced_kl(h, mean, std, weight)
+        kl_dynamics, kl_representation, kl = self._balanced_kl(h, tuple(posterior), weight)
         error = {}
         for key, name in self.cameras.items():
             residual = self.decoders[name](features.flatten(0, 1)) - self._centred(key, images)
@@ -260,7 +277,8 @@ class RSSM(EndAware):
         metrics = {key: value.item() for key, value in error.items()}
         return loss, features, {**metrics, "loss_state": error_state.item(), "kl": kl.item()}
 
-    def _filter_sampled(self, embedding: Tensor, clip: Clip) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _filter_sampled(self, embedding: Tensor, clip: Clip) -> list[Tensor]:
+        """h, x and the posterior's statistics of every frame: (B, T, ...) each."""
         batch, length = embedding.shape[:2]
         start = self.initial(batch)
         h, x = start["h"], start["x"]
@@ -269,17 +287,15 @@ class RSSM(EndAware):
             first = clip.is_first[:, t, None]
             h, x = torch.where(first, start["h"], h), torch.where(first, start["x"], x)
             h = self._recur(h, x, clip.action[:, t])
-            mean, std = self._posterior(h, embedding[:, t])
-            x = mean + std * randn_like(std)
-            rows.append((h, x, mean, std))
-        h, x, mean, std = (torch.stack(column, 1) for column in zip(*rows))
-        return h, x, mean, std
+            posterior = self._posterior(h, embedding[:, t])
+            x = self.stochastic.sample(posterior)
+            rows.append((h, x, *posterior))
+        return [torch.stack(column, 1) for column in zip(*rows)]
 
-    def _balanced_kl(self, h: Tensor, mean: Tensor, std: Tensor, weight: Tensor) -> tuple[Tensor, ...]:
-        prior_mean, prior_std = self._prior(h)
-        free = self.config.free_nats
-        dynamics = _gaussian_kl(mean.detach(), std.detach(), prior_mean, prior_std)
-        representation = _gaussian_kl(mean, std, prior_mean.detach(), prior_std.detach())
+    def _balanced_kl(self, h: Tensor, posterior: Statistics, weight: Tensor) -> tuple[Tensor, ...]:
+        prior, kl, free = self._prior(h), self.stochastic.kl, self.config.free_nats
+        fixed = lambda statistics: tuple(t.detach() for t in statistics)  # noqa: E731
+        dynamics, representation = kl(fixed(posterior), prior), kl(posterior, fixed(prior))
         mean_of = lambda kl: (kl * weight).sum()  # noqa: E731
         return (
             mean_of(dynamics.clamp(min=free)),
@@ -296,8 +312,3 @@ class RSSM(EndAware):
         for key, name in self.cameras.items():
             mean = getattr(self, f"mean_{name}")
             mean.lerp_(mean_over_ranks(clip.percepts[key].mean((0, 1))), float(1 / self.mean_count))
-
-
-def _gaussian_kl(mean1: Tensor, std1: Tensor, mean2: Tensor, std2: Tensor) -> Tensor:
-    """KL(N1 || N2) of diagonal Gaussians, summed over the last axis."""
-    return (torch.log(std2 / std1) + (std1**2 + (mean1 - mean2) ** 2) / (2 * std2**2) - 0.5).sum(-1)

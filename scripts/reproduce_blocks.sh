@@ -1,0 +1,36 @@
+#!/usr/bin/env bash
+# Everything of results/blocks from nothing, resumable: what is finished is skipped, what was killed goes on.
+#   scripts/reproduce_blocks.sh [--quick] [OUT]     OUT defaults to outputs/blocks
+# --quick runs the whole table small, in under 20 minutes on two cores, into OUT/results: its numbers mean nothing.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+quick=; [ "${1:-}" = --quick ] && { quick=1; shift; }
+OUT=${1:-outputs/blocks${quick:+_quick}}
+BIN=.venv/bin
+export HF_HUB_OFFLINE=1 OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
+mkdir -p "$OUT"
+
+training= critic= table="--output_dir=results/blocks"
+if [ "$quick" ]; then
+  training="--demonstrations=40 --pretraining=300 --steps=600 --collect_every=100 --batch_size=12 --save_every=200"
+  critic="--steps=600"
+  table="--output_dir=$OUT/results --n=12 --n_curve=4"
+fi
+
+# $training, $critic and $table are lists of options.
+# shellcheck disable=SC2086
+{
+  [ -e "$OUT/dreamer/episodes" ] ||
+    $BIN/latentsafe train-dreamer --config_path=configs/blocks_dreamer.yaml --output_dir="$OUT/dreamer" $training
+
+  for target in reachability risk; do
+    for seed in 0 1 2; do
+      [ -e "$OUT/$target/seed_$seed/integrity.json" ] || $BIN/latentsafe train-reachability --seeds="[$seed]" \
+        --policy.path="$OUT/dreamer/policy/world_model" --dataset.repo_id=local/blocks_dreamer \
+        --dataset.root="$OUT/dreamer/episodes" --output_dir="$OUT/$target/seed_$seed" --target=$target $critic
+    done
+  done
+
+  $BIN/python scripts/blocks_table2.py --dreamer "$OUT/dreamer/policy" --filters "$OUT"/reachability/seed_{0,1,2} \
+    --risks "$OUT"/risk/seed_{0,1,2} --cells "$OUT/cells" $table
+}

@@ -1,0 +1,271 @@
+"""The task policy learned in imagination, as a LeRobot policy, and its training, killed and not."""
+
+import json
+import shutil
+from pathlib import Path
+
+import draccus
+import numpy as np
+import pytest
+import tiny
+import torch
+from safetensors.torch import load_file
+from test_hub import hub  # noqa: F401
+
+from lerobot_latentsafe.baselines.dreamer.modeling_dreamer import LatentSafeDreamerPolicy, WorldModelMismatchError
+from lerobot_latentsafe.baselines.dreamer.replay import CAMERA_KEYS, Replay
+from lerobot_latentsafe.baselines.dreamer.training import DreamerTraining, TrainDreamer
+from lerobot_latentsafe.checkpoint import CheckpointError
+from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, UntrainedFilterError
+from lerobot_latentsafe.shield import BasePolicy
+from lerobot_latentsafe.training import halve_weights, train_reachability
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_blocks():
+    with tiny.short_blocks():
+        yield
+
+
+@pytest.fixture(scope="module")
+def trained(tiny_dreamer):
+    return tiny_dreamer
+
+
+@pytest.fixture
+def task_policy(trained):
+    return LatentSafeDreamerPolicy.from_pretrained(trained / "policy")
+
+
+def observation(n=2, size=128, seed=0):
+    rng = torch.Generator().manual_seed(seed)
+    images = {key: torch.rand(n, 3, size, size, generator=rng) for key in CAMERA_KEYS}
+    return {**images, "observation.state": torch.randn(n, 14, generator=rng)}
+
+
+def drive(policy, n=3):
+    policy.reset()
+    return torch.stack([policy.select_action(observation(seed=t)) for t in range(n)])
+
+
+# Training
+
+
+def weights(folder):
+    return {name: load_file(folder / name / "model.safetensors") for name in ("policy", "policy/world_model")}
+
+
+def test_a_killed_run_ends_as_one_that_was_not(trained, tmp_path):
+    class Killed(Exception):
+        pass
+
+    folder = tmp_path / "run"
+    run = DreamerTraining(tiny.dreamer_options(folder))
+    update = run.update
+
+    def update_or_die():
+        if run.step == 5:  # a round of episodes after the checkpoint of step 4
+            raise Killed
+        return update()
+
+    run.update = update_or_die
+    with pytest.raises(Killed):
+        run.run()
+    assert [p.name for p in (folder / "checkpoints").iterdir()] == ["0000004"]
+    resumed = DreamerTraining(tiny.dreamer_options(folder))
+    assert resumed.step == 4
+    resumed.run()
+    for name, expected in weights(trained).items():
+        found = weights(folder)[name]
+        assert found.keys() == expected.keys()
+        assert all(torch.equal(found[key], expected[key]) for key in expected), name
+    for name in (*CAMERA_KEYS, "action", "terms"):
+        np.testing.assert_array_equal(*(np.load(f / "replay" / f"{name}.npy") for f in (folder, trained)))
+
+
+def test_resuming_with_other_options_is_refused(trained):
+    with pytest.raises(ValueError, match="run with other options \\(batch_size\\)"):
+        DreamerTraining(tiny.dreamer_options(trained, batch_size=5))
+
+
+def test_a_finished_run_has_nothing_left_to_do(trained):
+    run = DreamerTraining(tiny.dreamer_options(trained))
+    assert run.step == run.options.steps
+    run.run()
+
+
+def test_all_parts_learn(trained, tmp_path):
+    run = DreamerTraining(tiny.dreamer_options(tmp_path / "run"))
+    before = {k: v.clone() for k, v in run.policy.state_dict().items()}
+    world_model = {k: v.clone() for k, v in run.policy.model.state_dict().items()}
+    for run.step in (0, 3, 4):
+        metrics = run.update()
+    assert {"loss", "loss_margin", "loss_reward", "loss_cloning", "loss_actor", "loss_critic"} <= set(metrics)
+    moved = {k.split(".")[0] for k, v in run.policy.state_dict().items() if not torch.equal(v, before[k])}
+    assert moved == {"actor", "critic", "reward", "slow_critic", "return_range"}
+    moved = {k.split(".")[0] for k, v in run.policy.model.state_dict().items() if not torch.equal(v, world_model[k])}
+    assert moved == {"world_model", "margin"}
+
+
+def test_batches_hold_a_tenth_of_demonstrations(trained):
+    run = DreamerTraining(tiny.dreamer_options(trained))
+    run.step, run.options.batch_size = 5, 20
+    clip, reward, demonstrated = run._batch()
+    assert demonstrated.sum() == 2 and reward.shape == clip.valid.shape == (20, 6)
+    run.step = 2  # before the policy has episodes
+    assert run._batch()[2].all()
+
+
+def test_rewards_are_those_of_the_frames(trained):
+    run = DreamerTraining(tiny.dreamer_options(trained))
+    run.step = 0
+    clip, reward, _ = run._batch()
+    terms = run.replay.arrays["terms"]
+    every = run.policy.config.behavior.rewards.reward(torch.from_numpy(terms[: 2 * tiny.BLOCKS_FRAMES]))
+    for row, valid in zip(reward, clip.valid):
+        kept = row[valid]
+        windows = every.unfold(0, len(kept), 1)
+        assert (windows - kept).abs().amax(1).min() < 1e-6
+
+
+def test_demonstrations_are_the_scripted_operators(trained):
+    replay = DreamerTraining(tiny.dreamer_options(trained)).replay
+    speed = 20 * np.linalg.norm(replay.arrays["action"][: tiny.BLOCKS_FRAMES, :3], axis=1)
+    assert speed.max() == pytest.approx(0.3, abs=1e-3)  # on the way to the blocks
+    assert replay.written.all()
+
+
+def test_replay_of_another_size_is_refused(tmp_path):
+    Replay.open(tmp_path, 2, 60, 16)
+    with pytest.raises(ValueError, match=r"shape \(120, 3, 16, 16\), expected \(180, 3, 16, 16\)"):
+        Replay.open(tmp_path, 3, 60, 16)
+
+
+@pytest.mark.parametrize("changes, message", [({"pretraining": 9}, "pretraining is 9"), ({"model": 0}, "model.type")])
+def test_bad_options_are_refused(tmp_path, changes, message):
+    if "model" in changes:
+        changes = {"model": tiny.dreamer_options(tmp_path).policy}
+    with pytest.raises(ValueError, match=message):
+        tiny.dreamer_options(tmp_path, **changes)
+
+
+def test_the_configuration_that_is_shipped_is_understood(tmp_path):
+    file = Path(__file__).parents[1] / "configs" / "blocks_dreamer.yaml"
+    changes = ["--policy.behavior.rewards.topple=5", f"--output_dir={tmp_path}"]
+    options = draccus.parse(TrainDreamer, config_path=file, args=changes)
+    assert options.model.world_model.classes == 16 and options.policy.behavior.rewards.topple == 5
+
+
+# The policy
+
+
+def test_loaded_policy_acts_as_the_saved_one(task_policy, tmp_path):
+    task_policy.save_pretrained(tmp_path / "copy")
+    actions = drive(LatentSafeDreamerPolicy.from_pretrained(tmp_path / "copy"))
+    torch.testing.assert_close(actions, drive(task_policy), rtol=0, atol=0)
+    assert actions.shape == (3, 2, 7) and task_policy.config.world_model_path != "world_model"
+
+
+def test_lerobot_makes_it_by_its_type(trained):
+    base = BasePolicy(trained / "policy", "cpu")
+    assert base.config.type == "latentsafe_dreamer"
+    base.reset()
+    assert base.propose(observation()).shape == (2, 7)
+
+
+def test_halved_weights_still_load(task_policy, tmp_path):
+    task_policy.save_pretrained(tmp_path / "half")
+    halve_weights(tmp_path / "half")
+    drive(LatentSafeDreamerPolicy.from_pretrained(tmp_path / "half"))
+
+
+def test_history_matters_until_reset(task_policy):
+    first = drive(task_policy, 2)
+    task_policy.reset()
+    assert not torch.equal(task_policy.select_action(observation(seed=1)), first[1])
+    torch.testing.assert_close(drive(task_policy, 2), first)
+
+
+def test_overridden_action_is_remembered(task_policy):
+    task_policy.reset()
+    action = task_policy.select_action(observation())
+    torch.testing.assert_close(task_policy.model.denormalise_action(task_policy.executed), action)
+    other = torch.zeros(2, 7)
+    task_policy.was_overridden(other)
+    expected = task_policy.model.normalise_action(other).clamp(-1, 1)
+    torch.testing.assert_close(task_policy.executed, expected)
+
+
+@pytest.mark.parametrize(
+    "name, value",
+    [("task", "lift the bag"), ("cameras", ["observation.images.top"]), ("fps", 15), ("action_names", ["x"])],
+)
+def test_world_model_of_something_else_is_refused(trained, name, value, tmp_path):
+    copy = shutil.copytree(trained / "policy", tmp_path / "copy")
+    tiny.rewrite_json(copy / "config.json", **{name: value})
+    with pytest.raises(WorldModelMismatchError, match=f"the world model has {name} = .*this policy was trained with"):
+        LatentSafeDreamerPolicy.from_pretrained(copy)
+
+
+def test_filter_of_another_task_does_not_shield_it(trained, tmp_path):
+    tiny.save_franka_filter(tmp_path / "filter", task="lift the bag")
+    filter = LatentSafePolicy.from_pretrained(tmp_path / "filter")
+    with pytest.raises(ValueError, match=r"has task = pluck the green block.*, the filter lift the bag"):
+        filter.attach(trained / "policy")
+
+
+def test_policies_of_other_types_are_refused(tiny_diffusion, trained):
+    with pytest.raises(CheckpointError, match="'diffusion' policy, expected latentsafe_dreamer"):
+        LatentSafeDreamerPolicy.from_pretrained(tiny_diffusion)
+    with pytest.raises(CheckpointError, match="'latentsafe_dreamer' policy, expected a 'latentsafe' filter"):
+        LatentSafePolicy.from_pretrained(trained / "policy")
+
+
+def test_from_nothing_it_says_how_to_train_one(task_policy):
+    from lerobot_latentsafe import LatentSafeDreamerConfig
+
+    with pytest.raises(UntrainedFilterError, match="latentsafe train-dreamer"):
+        LatentSafeDreamerPolicy(LatentSafeDreamerConfig(device="cpu"))
+    with pytest.raises(UntrainedFilterError, match="latentsafe train-dreamer"):
+        task_policy.forward({})
+
+
+# From the task policy to a filter
+
+
+def test_filter_is_trained_on_its_world_model_and_shields_it(trained, tmp_path):
+    from lerobot_latentsafe import LatentSafeBlocksEnv
+    from lerobot_latentsafe.evaluation.shielding import compare
+
+    episodes = tiny.metadata(trained / "episodes", "local/blocks_dreamer")
+    assert episodes.total_episodes == 2 + 2 * 2
+    policy = train_reachability(trained / "policy" / "world_model", episodes, tmp_path / "filter")
+    policy.attach(trained / "policy")
+    env = LatentSafeBlocksEnv()
+    policy.config.epsilon = 2.0
+    result = compare(policy, env, 2, seed=0)
+    assert result["shielded"]["overridden_share"] == 1
+
+
+def test_exported_episodes_are_the_replay(trained):
+    from lerobot_latentsafe.datasets.frame_cache import FrameCache
+
+    cache = FrameCache.open(trained / "episodes", tiny.metadata(trained / "episodes", "local/blocks_dreamer"))
+    replay = np.load(trained / "replay" / "observation.images.wrist.npy")
+    np.testing.assert_array_equal(cache.percepts["observation.images.wrist"], replay)
+    assert cache.manifest["cameras"]["observation.images.front"] == [128, 128, 3]
+
+
+def test_pulled_policy_acts_as_the_pushed_one(hub, task_policy, trained):  # noqa: F811
+    from lerobot_latentsafe.commands import PolicySource, Push
+
+    Push(policy=PolicySource(str(trained / "policy")), repo_id="me/dreamer", dataset_repo_id="me/blocks").run()
+    assert "world_model/model.safetensors" in hub.repos["me/dreamer"]
+    assert "fails at times, on purpose" in hub.repos["me/dreamer"]["README.md"].decode()
+    torch.testing.assert_close(drive(LatentSafeDreamerPolicy.from_pretrained("me/dreamer")), drive(task_policy))
+
+
+def test_log_counts_outcomes_of_each_round(trained):
+    rows = [json.loads(line) for line in (trained / "log.jsonl").read_text().splitlines()]
+    rounds = [row for row in rows if "round" in row]
+    assert [row["round"] for row in rounds] == [0, 1] and all(0 <= row["violation"] <= 2 for row in rounds)
