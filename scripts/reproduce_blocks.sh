@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Everything of results/blocks from nothing, resumable: what is finished is skipped, what was killed goes on.
 #   scripts/reproduce_blocks.sh [--quick] [OUT]     OUT defaults to outputs/blocks
-# --quick runs the whole table small, in under 20 minutes on two cores, into OUT/results: its numbers mean nothing.
+# --quick runs the whole table small, into OUT/results: its numbers mean nothing.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 quick=; [ "${1:-}" = --quick ] && { quick=1; shift; }
