@@ -43,7 +43,8 @@ class Still(BasePolicy):
     def reset(self):
         pass
 
-    replan = reset
+    def replan(self, executed):
+        pass
 
     def propose(self, observation):
         action = torch.zeros(len(observation["observation.state"]), 7)
