@@ -3,6 +3,10 @@
 import hashlib
 import json
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from lerobot.configs.policies import PreTrainedConfig
 
 PRETRAINED = Path(__file__).parent / "pretrained"
 WEIGHTS, INTEGRITY = "model.safetensors", "integrity.json"
@@ -42,6 +46,21 @@ def resolve_checkpoint(path: str | Path, revision: str | None = None, **hub: obj
             f"could not get {path!s} from the Hub ({type(e).__name__}: {e}). Check the id and the connection, "
             "or give a local folder"
         ) from e
+
+
+def read_config(folder: Path) -> "PreTrainedConfig":
+    """A checkpoint's configuration.
+
+    Raises:
+        CheckpointError: config.json is missing or not readable.
+    """
+    import draccus
+    from lerobot.configs.policies import PreTrainedConfig
+
+    try:
+        return PreTrainedConfig.from_pretrained(folder)
+    except (OSError, ValueError, draccus.utils.DecodingError) as e:
+        raise CheckpointError(f"{folder / 'config.json'} is missing or not readable ({e})") from e
 
 
 def _digest(file: Path) -> str:

@@ -52,6 +52,8 @@ class LatentSafeConfig(PreTrainedConfig):
         mode: `filter` overrides unsafe actions, `monitor` only reports what it would have done.
         deadline_ms: if set, a decision that took longer is not trusted, and the fallback acts.
         base_policy_path: the policy to shield: a folder, a Hub id or the name of a committed checkpoint.
+        base_ahead: if not 0, the base policy's next chunk of actions is made off the control thread, begun when so many
+            of the present one are still to come. For a base policy that takes longer than a period to think.
         cameras: the image features the filter reads, by default all of the dataset's.
         task: what the world model was trained to imagine, in words, where a policy of the same task must share it.
         robot_type: LeRobot's name of the robot that recorded the dataset.
@@ -93,6 +95,7 @@ class LatentSafeConfig(PreTrainedConfig):
     mode: str = "filter"
     deadline_ms: float | None = None
     base_policy_path: str | None = None
+    base_ahead: int = 0
 
     task: str | None = None
     cameras: list[str] | None = None
@@ -135,6 +138,8 @@ class LatentSafeConfig(PreTrainedConfig):
             raise ValueError(f"--policy.guard is {self.guard}; expected 1 (the paper's law) to 25 steps")
         if self.samples < 0:
             raise ValueError(f"--policy.samples is {self.samples}; expected 0 (mean or mode) or a number of draws")
+        if self.base_ahead < 0:
+            raise ValueError(f"--policy.base_ahead is {self.base_ahead}; expected 0 (on the control thread) or more")
         if self.margin_delta <= 0:
             raise ValueError(f"--policy.margin_delta is {self.margin_delta}; expected a positive number")
         self.require_critic_of_law()

@@ -8,12 +8,11 @@ import logging
 from pathlib import Path
 from typing import Any
 
-import draccus
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor
 
-from lerobot_latentsafe.checkpoint import CheckpointError, check_sealed, resolve_checkpoint, seal
+from lerobot_latentsafe.checkpoint import CheckpointError, check_sealed, read_config, resolve_checkpoint, seal
 from lerobot_latentsafe.configuration_latentsafe import STAGES, LatentSafeConfig
 from lerobot_latentsafe.datasets.clips import ClipReader
 from lerobot_latentsafe.datasets.frame_cache import to_model_images
@@ -212,7 +211,7 @@ class LatentSafePolicy(PreTrainedPolicy):
 
     def attach(self, path: str | Path) -> None:
         """Shield the policy at `path`: folder, Hub id or committed name."""
-        base = BasePolicy(path, self.config.device)
+        base = BasePolicy(path, self.config.device, self.config.base_ahead)
         own, theirs = self.config.action_feature, base.config.action_feature
         if theirs is None or tuple(own.shape) != tuple(theirs.shape):
             raise ValueError(
@@ -292,8 +291,6 @@ class LatentSafePolicy(PreTrainedPolicy):
         revision: str | None = None, strict: bool = True, **kwargs: Any,
     ) -> "LatentSafePolicy":  # fmt: skip
         """Load from a folder, a committed name or a Hub id; refuses what is cut, edited or of another type."""
-        from lerobot.configs.policies import PreTrainedConfig
-
         if pretrained_name_or_path is None:
             raise CheckpointError(
                 "a latentsafe policy needs a trained filter: give --policy.path=<filter> "
@@ -301,11 +298,7 @@ class LatentSafePolicy(PreTrainedPolicy):
             )
         hub = {k: kwargs.pop(k) for k in ("cache_dir", "token", "local_files_only", "force_download") if k in kwargs}
         folder = resolve_checkpoint(pretrained_name_or_path, revision, **{k: v for k, v in hub.items() if v})
-        if config is None:
-            try:
-                config = PreTrainedConfig.from_pretrained(folder)
-            except (OSError, ValueError, draccus.utils.DecodingError) as e:
-                raise CheckpointError(f"{folder / 'config.json'} is missing or not readable ({e})") from e
+        config = config or read_config(folder)
         if not isinstance(config, LatentSafeConfig):
             raise CheckpointError(
                 f"{pretrained_name_or_path} is a {config.type!r} policy, expected a 'latentsafe' filter; "

@@ -16,6 +16,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from lerobot_latentsafe.checkpoint import TRAINED
+from lerobot_latentsafe.chunks import ChunksAhead, queued_actions
 from lerobot_latentsafe.datasets.frame_cache import check_proportions
 from lerobot_latentsafe.filter import FilterDecision, Reason, least_restrictive
 from lerobot_latentsafe.world_models.base import Latent, map_latent, replace_rows
@@ -239,9 +240,10 @@ class BasePolicy:
     Args:
         path: folder, Hub id or the name of a committed checkpoint.
         device: where it runs.
+        ahead: if not 0, its chunks are made off the control thread; see `ChunksAhead`.
     """
 
-    def __init__(self, path: str | Path, device: str):
+    def __init__(self, path: str | Path, device: str, ahead: int = 0):
         from lerobot.configs.policies import PreTrainedConfig
         from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
@@ -265,15 +267,19 @@ class BasePolicy:
         self.preprocessor, self.postprocessor = make_pre_post_processors(
             config, pretrained_path=self.path, preprocessor_overrides={"device_processor": {"device": device}}
         )
+        self.chunks = ChunksAhead(self.policy, ahead) if ahead else None
 
     def reset(self) -> None:
         self.policy.reset()
+        if self.chunks is not None:
+            self.chunks.reset()
         self.preprocessor.reset()
         self.postprocessor.reset()
 
     def propose(self, observation: dict[str, Tensor]) -> Tensor:
         """Action (B, A) in robot units, through the base policy's own processors."""
-        return self.postprocessor(self.policy.select_action(self.preprocessor(dict(observation))))
+        act = self.policy.select_action if self.chunks is None else self.chunks.act
+        return self.postprocessor(act(self.preprocessor(dict(observation))))
 
     def replan(self, executed: Tensor) -> None:
         """Drop the rest of a planned chunk: after an intervention it belongs to a state that never came.
@@ -283,11 +289,10 @@ class BasePolicy:
         """
         if hasattr(self.policy, "was_overridden"):
             return self.policy.was_overridden(executed)
-        queues = getattr(self.policy, "_queues", None)
-        if isinstance(queues, dict) and "action" in queues:
-            queues["action"].clear()
-        elif hasattr(self.policy, "_action_queue"):
-            self.policy._action_queue.clear()
+        if self.chunks is not None:
+            self.chunks.replan()
+        elif (queue := queued_actions(self.policy)) is not None:
+            queue.clear()
         else:
             self.policy.reset()
 

@@ -57,9 +57,7 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     policy = LatentSafePolicy.from_pretrained(arguments.policy).eval()
-    for name in ("epsilon", "guard"):
-        if getattr(arguments, name) is not None:
-            setattr(policy.config, name, getattr(arguments, name))
+    policy.config.override(arguments, "epsilon", "guard")
     scene, table = BagScene(), {}
     for operator in arguments.operators:
         for law in arguments.laws:

@@ -5,13 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor
 
 from lerobot_latentsafe.baselines.dreamer.behavior import Actor, ReturnRange, TwoHotHead, imagine, lambda_returns
 from lerobot_latentsafe.baselines.dreamer.configuration_dreamer import LatentSafeDreamerConfig
-from lerobot_latentsafe.checkpoint import CheckpointError, resolve_checkpoint
+from lerobot_latentsafe.checkpoint import CheckpointError, read_config, resolve_checkpoint
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, UntrainedFilterError
 from lerobot_latentsafe.world_models.base import Clip, Latent
 
@@ -168,7 +167,7 @@ class LatentSafeDreamerPolicy(PreTrainedPolicy):
     ) -> "LatentSafeDreamerPolicy":  # fmt: skip
         """Load from a folder, a committed name or a Hub id."""
         folder = resolve_checkpoint(pretrained_name_or_path, revision)
-        config = config or PreTrainedConfig.from_pretrained(folder)
+        config = config or read_config(folder)
         if not isinstance(config, LatentSafeDreamerConfig):
             raise CheckpointError(f"{pretrained_name_or_path} is a {config.type!r} policy, expected latentsafe_dreamer")
         if config.world_model_path == WORLD_MODEL_FOLDER:

@@ -1,0 +1,87 @@
+"""Action chunks made off the control thread: a base policy that thinks for longer than a period is not late."""
+
+import copy
+from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from lerobot.policies.pretrained import PreTrainedPolicy
+
+
+class ChunksAhead:
+    """Plays the chunks of a LeRobot policy, and has the next one made in another thread before the present one ends.
+
+    A chunk starts at the tick whose observation it was begun on: actions whose time is past when it is taken up are
+    left out. If it is not ready by then, the control thread waits for it.
+
+    Args:
+        policy: one that plays its chunks from a queue of actions, such as LeRobot's diffusion policy or ACT.
+        ahead: actions of a chunk that are still to come when the next one is begun.
+
+    Raises:
+        ValueError: the policy makes no chunks, or too short ones.
+    """
+
+    def __init__(self, policy: "PreTrainedPolicy", ahead: int):
+        self.policy, self.ahead = policy, ahead
+        length = getattr(policy.config, "n_action_steps", 1)
+        if queued_actions(policy) is None or length < ahead + 2:
+            raise ValueError(
+                f"--policy.base_ahead is {ahead}, but the base policy ({policy.config.type}) plays chunks of {length} "
+                f"actions; expected at most {max(length - 2, 0)} (0: chunks are made on the control thread)"
+            )
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="chunks")
+        self.reset()
+
+    def reset(self) -> None:
+        """Start an episode."""
+        self._playing: deque[Tensor] = deque()
+        self._next: Future[Tensor] | None = None
+        self._ticks = 0
+
+    def act(self, batch: dict[str, Tensor]) -> Tensor:
+        """The next action (B, A) of the policy's own units, given what it sees now."""
+        self._batch, self._ticks = self._remember(batch), self._ticks + 1
+        if not self._playing:
+            if self._next is None:
+                self._begin()
+            chunk, self._next = self._next.result(), None
+            self._playing.extend(chunk.unbind(1)[self._ticks :])
+        action = self._playing.popleft()
+        if len(self._playing) <= self.ahead and self._next is None:
+            self._begin()
+        return action
+
+    def replan(self) -> None:
+        """Drop what is planned, as something else was done: the next chunk is of what is seen now."""
+        self._playing.clear()
+        if self._next is None or self._ticks > 0:
+            self._begin()
+
+    def _remember(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Have the policy take in an observation, without planning. Returns what its chunk is made of."""
+        queue = queued_actions(self.policy)
+        queue.clear()
+        queue.append(None)  # a policy that still has an action to play plans none
+        self.policy.select_action(dict(batch))
+        seen = {key: past[-1] for key, past in getattr(self.policy, "_queues", {}).items() if past}
+        return {key: value for key, value in {**batch, **seen}.items() if key != "action"}
+
+    def _begin(self) -> None:
+        self._ticks = 0
+        planner = copy.copy(self.policy)  # the same weights; what it saw until now, whatever is seen meanwhile
+        if hasattr(self.policy, "_queues"):
+            planner._queues = {key: deque(past, past.maxlen) for key, past in self.policy._queues.items()}
+        self._next = self._worker.submit(torch.no_grad()(planner.predict_action_chunk), self._batch)
+
+
+def queued_actions(policy: "PreTrainedPolicy") -> deque | None:
+    """The queue that a LeRobot policy plays its chunks from, if it has one."""
+    queues = getattr(policy, "_queues", None)
+    if isinstance(queues, dict) and "action" in queues:
+        return queues["action"]
+    return getattr(policy, "_action_queue", None)
