@@ -11,9 +11,7 @@ starts under the first filter. Each run is kept in a .jsonl beside the output: a
 
 import argparse
 from collections.abc import Iterator
-from dataclasses import asdict
 from functools import cache, lru_cache
-from itertools import batched
 from pathlib import Path
 
 import numpy as np
@@ -22,16 +20,17 @@ import torch
 from lerobot_latentsafe.configuration_latentsafe import LAWS
 from lerobot_latentsafe.envs.bag import VARIANTS, BagScene
 from lerobot_latentsafe.evaluation.bag import (
-    FIRST_SEED,
     FilterSetting,
     against_bare,
+    as_job,
     drive,
     in_short,
+    run_cells,
     summary,
     traces,
 )
 from lerobot_latentsafe.evaluation.figures import save, value_profiles
-from lerobot_latentsafe.evaluation.rollouts import provenance, run_resumable, write_json
+from lerobot_latentsafe.evaluation.rollouts import write_json
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.teleoperators.scripted.behaviors import Actions, begin
 
@@ -80,29 +79,24 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=1, help="processes")
     parser.add_argument("--output", type=Path, default=Path("results/bag/out_of_distribution.json"))
     arguments = parser.parse_args()
-    chosen = arguments.law, arguments.epsilon, arguments.guard
-    settings = [FilterSetting.of(path, *chosen) for path in arguments.filters]
-    seeds = [FIRST_SEED + i for i in range(arguments.n)]
-    cells = [(setting, variant) for setting in (None, *settings) for variant in (SEEN, *UNSEEN)]
-    jobs = [
-        {"variant": variant, "filter": asdict(setting) if setting else None, "seed": seed}
-        for setting, variant in cells
-        for seed in seeds
-    ]
-    rows = run_resumable(arguments.output.with_suffix(".jsonl"), jobs, run, arguments.workers)
-    runs = dict(zip(cells, map(list, batched(rows, len(seeds)))))
+    settings = FilterSetting.all(arguments.filters, [arguments.law], arguments)
+    cells = {
+        (variant, setting): {"variant": variant, "filter": as_job(setting)}
+        for setting in (None, *settings)
+        for variant in (SEEN, *UNSEEN)
+    }
+    runs, made_by = run_cells(arguments.output, cells, arguments.n, run, arguments.workers)
 
     table, n_candies = {}, scene(SEEN).n_candies
     for variant in (SEEN, *UNSEEN):
-        bare, shielded = runs[None, variant], {setting.path: runs[setting, variant] for setting in settings}
+        bare, shielded = runs[variant, None], {setting.path: runs[variant, setting] for setting in settings}
         table[variant] = {"bare": summary(bare, n_candies), **against_bare(bare, shielded, n_candies)}
         for name, cell in table[variant].items():
             print(f"{variant}, {name}: {in_short(cell)}")
-    panels = {variant: traces(runs[settings[0], variant]) for variant in table}
+    panels = {variant: traces(runs[variant, settings[0]]) for variant in table}
     save(value_profiles(panels, settings[0].epsilon, scene(SEEN).fps), arguments.output.with_suffix(".png"))
     used = {s.path: {"law": s.law, "epsilon": s.epsilon, "guard": s.guard} for s in settings}
-    cpu_minutes = sum(row["cpu_s"] for row in rows) / 60
-    write_json(arguments.output, {**table, "filters": used, **provenance([seeds[0], seeds[-1]], cpu_minutes)})
+    write_json(arguments.output, {**table, "filters": used, **made_by})
 
 
 if __name__ == "__main__":

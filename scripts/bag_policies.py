@@ -9,9 +9,7 @@ spill at least p% of the candies. Each run is kept in a .jsonl beside the output
 """
 
 import argparse
-from dataclasses import asdict
 from functools import cache, lru_cache
-from itertools import batched
 from pathlib import Path
 
 import numpy as np
@@ -22,14 +20,15 @@ from lerobot_latentsafe.envs.bag import BagScene
 from lerobot_latentsafe.evaluation.bag import (
     FIRST_SEED,
     FilterSetting,
-    against_bare,
+    as_job,
     drive,
     fingerprint,
     in_short,
-    summary,
+    run_cells,
+    tabulate,
 )
 from lerobot_latentsafe.evaluation.figures import save, severity, write_side_by_side
-from lerobot_latentsafe.evaluation.rollouts import provenance, run_resumable, write_json
+from lerobot_latentsafe.evaluation.rollouts import write_json
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.shield import BasePolicy
 
@@ -43,10 +42,9 @@ def actor(base: str, setting: FilterSetting | None) -> BasePolicy | LatentSafePo
     return setting.load(base) if setting else BasePolicy(base, "cpu")
 
 
-def job(base: str, setting: FilterSetting | None, seed: int) -> dict:
-    """All that a run depends on."""
-    filtered = asdict(setting) if setting else None
-    return {"base": base, "base_fingerprint": fingerprint(base), "filter": filtered, "seed": seed}
+def job(base: str, setting: FilterSetting | None) -> dict:
+    """All that a run depends on but its seed."""
+    return {"base": base, "base_fingerprint": fingerprint(base), "filter": as_job(setting)}
 
 
 def run(job: dict, frames: list[np.ndarray] | None = None) -> dict:
@@ -66,15 +64,6 @@ def film(name: str, bare: dict, shielded: dict, folder: Path) -> Path:
     return write_side_by_side(columns, folder / f"{name}_{bare['seed']}.mp4", scene().fps)
 
 
-def tabulate(bare: list[dict], shielded: dict[FilterSetting, list[dict]]) -> dict:
-    """The results of one policy: bare, and law -> filter -> what it changes."""
-    table = {"bare": summary(bare, scene().n_candies)}
-    for law in dict.fromkeys(setting.law for setting in shielded):
-        rows = {setting.path: runs for setting, runs in shielded.items() if setting.law == law}
-        table[law] = against_bare(bare, rows, scene().n_candies)
-    return table
-
-
 def draw(table: dict[str, dict], law: str, path: Path) -> None:
     """How many runs spill at least p%, bare and under the filters of a law together."""
     lost = {}
@@ -88,7 +77,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--weak", help="policy that learnt from careless demonstrations")
     parser.add_argument("--strong", help="policy that learnt from careful ones")
     parser.add_argument("--filters", nargs="+", required=True)
-    parser.add_argument("--laws", nargs="+", choices=LAWS, default=list(LAWS))
+    parser.add_argument("--laws", nargs="+", choices=LAWS, default=["reachability", "plan", "margin"])
     parser.add_argument("--n", type=int, default=100)
     parser.add_argument("--epsilon", type=float)
     parser.add_argument("--guard", type=int)
@@ -106,26 +95,23 @@ def parse() -> argparse.Namespace:
 def main() -> None:
     arguments = parse()
     bases = {name: path for name in ("weak", "strong") if (path := getattr(arguments, name))}
-    pairs = [(law, path) for law in arguments.laws for path in arguments.filters]
-    settings = [FilterSetting.of(path, law, arguments.epsilon, arguments.guard) for law, path in pairs]
-    seeds = [FIRST_SEED + i for i in range(arguments.n)]
-    cells = [(who, setting) for who in bases for setting in (None, *settings)]
-    jobs = [job(bases[who], setting, seed) for who, setting in cells for seed in seeds]
-    rows = run_resumable(arguments.output.with_suffix(".jsonl"), jobs, run, arguments.workers)
-    runs = dict(zip(cells, map(list, batched(rows, len(seeds)))))
+    settings = FilterSetting.all(arguments.filters, arguments.laws, arguments)
+    cells = {(who, setting): job(bases[who], setting) for who in bases for setting in (None, *settings)}
+    runs, made_by = run_cells(arguments.output, cells, arguments.n, run, arguments.workers)
 
-    table = {who: tabulate(runs[who, None], {s: runs[who, s] for s in settings}) for who in bases}
+    n_candies = scene().n_candies
+    table = {who: tabulate(runs[who, None], {s: runs[who, s] for s in settings}, n_candies) for who in bases}
     for who, laws in table.items():
         print(f"{who}, bare: {in_short(laws['bare'])}")
-        for law, path in pairs:
-            print(f"{who}, {law} of {path}: {in_short(laws[law][path])}")
+        for setting in settings:
+            print(f"{who}, {setting.law} of {setting.path}: {in_short(laws[setting.law][setting.path])}")
     draw(table, arguments.laws[0], arguments.output.with_name("severity.png"))
     used = {s.path: {"epsilon": s.epsilon, "guard": s.guard} for s in settings}
-    cpu_minutes = sum(row["cpu_s"] for row in rows) / 60
-    write_json(arguments.output, {**table, "filters": used, **provenance([seeds[0], seeds[-1]], cpu_minutes)})
-    for who, base in bases.items():
-        for seed in seeds[: arguments.n_videos]:
-            print(film(who, job(base, None, seed), job(base, settings[0], seed), arguments.output.parent / "videos"))
+    write_json(arguments.output, {**table, "filters": used, **made_by})
+    for who in bases:
+        for seed in range(FIRST_SEED, FIRST_SEED + arguments.n_videos):
+            bare, shielded = ({**cells[who, setting], "seed": seed} for setting in (None, settings[0]))
+            print(film(who, bare, shielded, arguments.output.parent / "videos"))
 
 
 if __name__ == "__main__":

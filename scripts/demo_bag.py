@@ -27,7 +27,7 @@ def run(demo: Demo, filter: str, base: str, law: str, n: int) -> None:
     )
     operators = (
         f"operators: {few} lifts by either end, bare and shielded",
-        *("python", "scripts/bag_operators.py", f"--policy={filter}", "--laws", "bare", law, "--operators"),
+        *("python", "scripts/bag_operators.py", "--filters", filter, "--laws", law, "--operators"),
         *(*OPERATORS, f"--n={few}", f"--output={demo.out}/operators.json"),
     )
     with ThreadPoolExecutor(2) as cores:
@@ -40,9 +40,8 @@ def cells(out: Path, law: str) -> dict[str, dict]:
     policies, operators = (json.loads((out / f"{name}.json").read_text()) for name in ("policies", "operators"))
     found = {"diffusion policy": policies["weak"]["bare"], "the same, shielded": policies["weak"][law]["pooled"]}
     for name, does in OPERATORS.items():
-        found[f"operator {does}"], found[f"the same operator ({name}), shielded"] = (
-            operators[f"{name} {which}"] for which in ("bare", law)
-        )
+        found[f"operator {does}"] = operators[name]["bare"]
+        found[f"the same operator ({name}), shielded"] = operators[name][law]["pooled"]
     return found
 
 

@@ -82,9 +82,9 @@ def test_policies_are_compared_operators_traced_and_the_demo_tells(script, filte
     script("bag_policies", *options).main()
     assert policies.with_suffix(".jsonl").read_text() == kept  # nothing was run again
 
-    given = ["--laws", "bare", "margin", "--operators", "closed_end", "open_end", "--n=1", f"--output={operators}"]
-    script("bag_operators", f"--policy={filter_path}", *given).main()
-    traces = json.loads(operators.read_text())["closed_end margin"]["traces"]
+    given = ["--laws", "margin", "--operators", "closed_end", "open_end", "--n=1", f"--output={operators}"]
+    script("bag_operators", "--filters", filter_path, *given).main()
+    traces = json.loads(operators.read_text())["closed_end"]["traces"]
     assert len(traces) == 1 and len(traces[0]["value"]) == STEPS
 
     script("demo_bag").report(tmp_path, "margin", 90.0)

@@ -2,8 +2,11 @@
 
 import hashlib
 import time
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable
+from dataclasses import asdict, dataclass
 from functools import cache
+from itertools import batched
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -12,7 +15,7 @@ from torch import Tensor
 from lerobot_latentsafe.checkpoint import WEIGHTS, resolve_checkpoint
 from lerobot_latentsafe.envs.bag import BagScene
 from lerobot_latentsafe.envs.franka import CAMERAS
-from lerobot_latentsafe.evaluation.rollouts import paired_p_value, wilson
+from lerobot_latentsafe.evaluation.rollouts import paired_p_value, provenance, run_resumable, wilson
 from lerobot_latentsafe.filter import FilterDecision
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.shield import BasePolicy
@@ -47,6 +50,11 @@ class FilterSetting:
         epsilon, guard = own.epsilon if epsilon is None else epsilon, own.guard if guard is None else guard
         return cls(path, law, epsilon, guard, fingerprint(path))
 
+    @classmethod
+    def all(cls, paths: list[str], laws: list[str], options: object) -> list["FilterSetting"]:
+        """Filters under laws, with the epsilon and guard of a command line's options."""
+        return [cls.of(path, law, options.epsilon, options.guard) for law in laws for path in paths]
+
     def load(self, base: str | None = None) -> LatentSafePolicy:
         """The filter, with the policy it is to shield, if any."""
         policy = LatentSafePolicy.from_pretrained(self.path).eval()
@@ -54,6 +62,11 @@ class FilterSetting:
         if base is not None:
             policy.attach(base)
         return policy
+
+
+def as_job(setting: FilterSetting | None) -> dict | None:
+    """As a part of a job; back by `FilterSetting(**...)`."""
+    return asdict(setting) if setting else None
 
 
 @cache
@@ -132,6 +145,26 @@ def _overrides(decisions: list[FilterDecision]) -> dict:
     return {"overridden": sum(intervened), "first": first, "value": value, "margin": margin, "intervened": intervened}
 
 
+def run_cells[Cell: Hashable](
+    path: Path, cells: dict[Cell, dict], n: int, run: Callable[[dict], dict], workers: int = 1
+) -> tuple[dict[Cell, list[dict]], dict]:
+    """Episodes of all cells of a table from the same starts, each kept as it ends; see `run_resumable`.
+
+    Args:
+        path: of the table that will be written; the file of episodes is beside it.
+        cells: cell -> the job of its episodes, without their seed.
+        n: episodes of a cell.
+
+    Returns:
+        Cell -> its rows; and their provenance.
+    """
+    seeds = range(FIRST_SEED, FIRST_SEED + n)
+    jobs = [{**job, "seed": seed} for job in cells.values() for seed in seeds]
+    rows = run_resumable(path.with_suffix(".jsonl"), jobs, run, workers)
+    runs = dict(zip(cells, map(list, batched(rows, n))))
+    return runs, provenance([seeds[0], seeds[-1]], sum(row["cpu_s"] for row in rows) / 60)
+
+
 def summary(rows: list[dict], n_candies: int) -> dict:
     """What became of the candies, and what the filter did about it, over the episodes of one cell.
 
@@ -180,6 +213,15 @@ def against_bare(bare: list[dict], shielded: dict[str, list[dict]], n_candies: i
     for name, rows in shielded.items():
         table[name]["paired_p"] = paired_p_value(*(np.array([r["lost"] for r in part]) > 0 for part in (bare, rows)))
     return {**table, "pooled": _change(bare * len(shielded), pooled, n_candies)}
+
+
+def tabulate(bare: list[dict], shielded: dict[FilterSetting, list[dict]], n_candies: int) -> dict:
+    """One cell bare and under filters: `bare`, and law -> what its filters change, see `against_bare`."""
+    table = {"bare": summary(bare, n_candies)}
+    for law in dict.fromkeys(setting.law for setting in shielded):
+        rows = {setting.path: runs for setting, runs in shielded.items() if setting.law == law}
+        table[law] = against_bare(bare, rows, n_candies)
+    return table
 
 
 def _change(bare: list[dict], shielded: list[dict], n_candies: int) -> dict:
