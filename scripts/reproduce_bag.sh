@@ -36,17 +36,20 @@ filter() { # seed
     --output_dir="$OUT/filter_$1" --seeds="[$1]"
 }
 
-record bag_mix bag_mix 0
-record bag_branches bag_branches 0
-record bag_climbs_0 bag_climbs 0
-record bag_climbs_2 bag_climbs 2
-record held_branches bag_branches 1 150
-record held_lifts bag_lifts 1 120
+record bag_mix bag_mix 0 400
+record bag_branches bag_branches 0 150
+record bag_climbs bag_climbs 0
+record bag_lifts bag_lifts 0 100
+record bag_strong bag_strong 0
+record bag_weak bag_weak 0
+record held_branches bag_branches 1 50
+record held_lifts bag_lifts 1 40
+# Careless demonstrations are of a bag that is sealed, and would tell the filter that nothing can fall out.
 [ -e "$DATA/bag" ] || $BIN/python - "$DATA" <<'EOF'
 import sys
 from pathlib import Path
 from lerobot.datasets.aggregate import aggregate_datasets
-data, parts = Path(sys.argv[1]), ["bag_mix", "bag_branches", "bag_climbs_0", "bag_climbs_2"]
+data, parts = Path(sys.argv[1]), ["bag_mix", "bag_branches", "bag_climbs", "bag_lifts", "bag_strong"]
 aggregate_datasets([f"latentsafe/{p}" for p in parts], "latentsafe/bag", [data / p for p in parts], data / "bag.begun")
 (data / "bag.begun").rename(data / "bag")
 EOF
@@ -63,7 +66,6 @@ for seed in $SEEDS; do
 done
 
 for kind in weak strong; do
-  record "bag_$kind" "bag_$kind" 0
   [ -e "$OUT/diffusion_$kind" ] || $BIN/python scripts/train_seeing_policy.py --dataset="$DATA/bag_$kind" \
     --output="$OUT/diffusion_$kind"
 done

@@ -17,6 +17,7 @@ def size_of(name):
 
 def test_names_that_users_rely_on_are_committed():
     assert {"dubins", "dubins_diffusion_reckless"} <= set(committed_names())
+    assert {"bag", "bag_diffusion_weak", "bag_diffusion_strong"} <= set(committed_names())
 
 
 def test_every_committed_checkpoint_loads():
@@ -28,15 +29,17 @@ def test_every_committed_checkpoint_loads():
             check_sealed(PRETRAINED / name)
             assert LatentSafePolicy.from_pretrained(name).config.stage == "reachability"
         else:
-            assert BasePolicy(name, "cpu").config.output_features["action"].shape == (2,)
+            assert BasePolicy(name, "cpu").config.output_features["action"].shape in {(2,), (7,)}
 
 
-def test_filter_is_small():
-    assert 0 < size_of("dubins") <= 5e6
+def test_weights_are_small():
+    assert 0 < size_of("dubins") <= 5e6 and 0 < size_of("bag") <= 5e6
+    assert sum(size_of(name) for name in committed_names()) <= 20e6
 
 
-def test_filter_stores_no_path_of_the_machine_it_was_trained_on():
-    config = LatentSafePolicy.from_pretrained("dubins").config
+@pytest.mark.parametrize("name", ["dubins", "bag"])
+def test_filter_stores_no_path_of_the_machine_it_was_trained_on(name):
+    config = LatentSafePolicy.from_pretrained(name).config
     assert config.frame_cache is None and config.base_policy_path is None
 
 
@@ -61,3 +64,19 @@ def test_filter_shields_the_committed_diffusion_policy():
     result = compare(policy, LatentSafeDubinsEnv(), 12, seed=500)
     assert result["bare"]["violation"]["k"] >= 3  # it is reckless
     assert result["shielded"]["violation"]["k"] < result["bare"]["violation"]["k"]
+
+
+def test_filter_keeps_the_candies_in_the_bag_that_an_operator_pulls_up_by_its_closed_end():
+    from lerobot_latentsafe.envs.bag import BagScene
+    from lerobot_latentsafe.evaluation.bag import drive
+    from lerobot_latentsafe.teleoperators.scripted.behaviors import begin
+
+    scene, policy = BagScene(), LatentSafePolicy.from_pretrained("bag").eval()
+    lost = {}
+    for name, actor in {"bare": None, "shielded": policy}.items():
+        lost[name] = 0
+        for seed in (500, 501):
+            scene.reset(seed)
+            operator = begin("closed_end", scene, None, np.random.default_rng([0, seed]))
+            lost[name] += drive(scene, actor, operator)["lost"]
+    assert lost["bare"] >= scene.n_candies and lost["shielded"] <= lost["bare"] / 4
