@@ -1,11 +1,13 @@
-"""A frozen encoder's view of the cameras as `observation.environment_state`, for any LeRobot policy.
+"""Where to grasp, seen by a frozen encoder, as `observation.environment_state` for any LeRobot policy.
 
 A LeRobot policy that reads images trains a network of its own on them. On a small machine it can instead be trained on
-what a filter's encoder sees: `with_views` adds that to a cached dataset, and the step below does the same to live
+what a filter's encoder sees. Of that, its demonstrations tell what matters: where the arm was when the fingers next
+closed. `with_aim` learns to foresee it and adds it to a cached dataset; the step below does the same to live
 observations, so that the trained policy runs wherever there are cameras.
 """
 
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,99 +15,169 @@ import numpy as np
 import torch
 from lerobot.configs import FeatureType, PipelineFeatureType, PolicyFeature
 from lerobot.processor import DeviceProcessorStep, ObservationProcessorStep, ProcessorStepRegistry
-from lerobot.utils.constants import OBS_ENV_STATE
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from torch import Tensor, nn
+from tqdm import trange
 
 if TYPE_CHECKING:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-VIEWS = "views.safetensors"
-"""The principal components, beside the dataset that was given its views."""
-SAMPLED_FRAMES = 4000
-"""From which principal components are found."""
+AIM = "aim.safetensors"
+"""The network, beside the dataset that it was learned on."""
+KEYPOINTS, HIDDEN, DROPOUT = 16, 128, 0.1
+STEPS, LEARNING_RATE = 2000, 3e-3
+MOSTLY, RARELY = 112, 16
+"""Frames of a batch from before the fingers close, the few that matter, and of any frames."""
+
+
+class Aim(nn.Module):
+    """How the hand will move until the fingers next close, foreseen from a frame.
+
+    Each camera's patches vote for the places of a few learned keypoints (a spatial softmax): what is learned of an
+    object in one place then holds in others, which components of whole pictures would have to be shown.
+
+    Args:
+        n_cameras, n_patches, token_dim: of the tokens (N, n_patches, token_dim) of all cameras.
+        state_dim: S, of proprioception.
+        n_moves: M, numbers that tell a motion.
+    """
+
+    def __init__(self, n_cameras: int, n_patches: int, token_dim: int, state_dim: int, n_moves: int):
+        super().__init__()
+        side = round(n_patches**0.5)
+        places = torch.linspace(-1, 1, side)
+        self.places = torch.cartesian_prod(places, places)
+        self.votes = nn.ModuleList([nn.Linear(token_dim // n_cameras, KEYPOINTS) for _ in range(n_cameras)])
+        self.head = nn.Sequential(
+            nn.Linear(n_cameras * KEYPOINTS * 2 + state_dim, HIDDEN),
+            nn.ReLU(),
+            nn.Dropout(DROPOUT),
+            nn.Linear(HIDDEN, n_moves),
+        )
+        for name, size in {"token": token_dim, "state": state_dim, "move": n_moves}.items():
+            self.register_buffer(f"{name}_mean", torch.zeros(size))
+            self.register_buffer(f"{name}_std", torch.ones(size))
+
+    def forward(self, tokens: Tensor, state: Tensor) -> Tensor:
+        """Tokens (N, P, C) and proprioception (N, S) -> the motion (N, M), in the units of proprioception."""
+        tokens = (tokens - self.token_mean) / self.token_std
+        cameras = tokens.chunk(len(self.votes), -1)
+        places = self.places.to(tokens)
+        points = [
+            torch.einsum("npk,pd->nkd", vote(part).softmax(1), places).flatten(1)
+            for vote, part in zip(self.votes, cameras)
+        ]
+        moves = self.head(torch.cat([*points, (state - self.state_mean) / self.state_std], -1))
+        return moves * self.move_std + self.move_mean
+
+    def fit(self, tokens: Tensor, state: Tensor, move: Tensor) -> None:
+        """Learn from frames: tokens (N, P, C), proprioception (N, S), the motion that came (N, M)."""
+        self.token_mean.copy_(tokens.mean((0, 1)))
+        self.token_std.copy_(tokens.std((0, 1)).clamp(min=1e-4))
+        self.state_mean.copy_(state.mean(0))
+        self.state_std.copy_(state.std(0).clamp(min=1e-3))
+        optimizer = torch.optim.AdamW(self.parameters(), LEARNING_RATE, weight_decay=1e-2)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, STEPS)
+        self.train()
+        before = move.any(-1).nonzero()[:, 0]
+        self.move_mean.copy_(move[before].mean(0))
+        self.move_std.copy_(move[before].std(0).clamp(min=1e-3))
+        for _ in trange(STEPS, desc="aim", unit="step"):
+            rows = torch.cat([before[torch.randint(len(before), (MOSTLY,))], torch.randint(len(state), (RARELY,))])
+            error = (self(tokens[rows], state[rows]) - move[rows]) / self.move_std
+            loss = error.square().mean()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            schedule.step()
+        self.eval()
 
 
 @ProcessorStepRegistry.register("latentsafe_perceive")
 class PerceiveStep(ObservationProcessorStep):
-    """Adds each camera's view, the principal components of its tokens, to an observation whose images are tensors.
-
-    The components are those of the policy's own demonstrations, camera by camera: what moves in one picture does not
-    crowd out what moves in the other.
+    """Adds the aim to an observation whose images are tensors.
 
     Args:
         encoder, encoder_hash: see `PerceptionConfig`.
-        components: of each camera.
         image_size: side to which images (B, 3, H, W) in [0, 1] are area-averaged.
         cameras: their keys in the observation.
+        state_dim, n_moves: see `Aim`.
     """
 
-    def __init__(self, encoder: str, encoder_hash: str, components: int, image_size: int, cameras: list[str]):
+    def __init__(
+        self, encoder: str, encoder_hash: str, image_size: int, cameras: list[str], state_dim: int, n_moves: int
+    ):
         from lerobot_latentsafe.world_models.perception import Perception, PerceptionConfig
 
-        self.config = PerceptionConfig(encoder=encoder, encoder_hash=encoder_hash, components=components)
+        self.config = PerceptionConfig(encoder=encoder, encoder_hash=encoder_hash)
         self.perception = Perception(self.config, cameras, image_size)
-        self.views = camera_views(len(cameras), self.perception.n_patches, self.perception.token_dim, components)
+        self.sizes = {"state_dim": state_dim, "n_moves": n_moves}
+        self.aim = Aim(len(cameras), self.perception.n_patches, self.perception.token_dim, **self.sizes).eval()
 
+    @torch.no_grad()
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
         from lerobot_latentsafe.datasets.frame_cache import to_model_images
 
         perception = self.perception
-        missing = [key for key in perception.image_keys if key not in observation]
+        missing = [key for key in (*perception.image_keys, OBS_STATE) if key not in observation]
         if missing:
             raise KeyError(
                 f"observation lacks {', '.join(missing)}, which this policy sees by; got {', '.join(observation)}"
             )
         images = {key: to_model_images(observation[key], perception.image_size) for key in perception.image_keys}
         tokens = perception.tokens(images)
-        return {**observation, OBS_ENV_STATE: see(self.views.to(tokens.device), tokens)}
+        return {**observation, OBS_ENV_STATE: self.aim.to(tokens.device)(tokens, observation[OBS_STATE])}
 
     def get_config(self) -> dict[str, Any]:
-        config, perception = self.config, self.perception
         return {
-            "encoder": config.encoder,
-            "encoder_hash": config.encoder_hash,
-            "components": config.components,
-            "image_size": perception.image_size,
-            "cameras": perception.image_keys,
+            "encoder": self.config.encoder,
+            "encoder_hash": self.config.encoder_hash,
+            "image_size": self.perception.image_size,
+            "cameras": self.perception.image_keys,
+            **self.sizes,
         }
 
     def state_dict(self) -> dict[str, Tensor]:
-        # In 16 bits: half of a small policy would be these.
-        state = self.views.state_dict()
-        return {name: t.half() if t.is_floating_point() else t.clone() for name, t in state.items()}
+        return {name: value.clone() for name, value in self.aim.state_dict().items()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        self.views.load_state_dict(state)
+        self.aim.load_state_dict(state)
 
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
     ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        seen = PolicyFeature(FeatureType.ENV, (self.config.components * len(self.views),))
+        seen = PolicyFeature(FeatureType.ENV, (self.sizes["n_moves"],))
         observed = {**features.get(PipelineFeatureType.OBSERVATION, {}), OBS_ENV_STATE: seen}
         return {**features, PipelineFeatureType.OBSERVATION: observed}
 
 
-def camera_views(n_cameras: int, n_patches: int, token_dim: int, components: int) -> nn.ModuleList:
-    """A basis for each camera's share of tokens (N, n_patches, token_dim)."""
-    from lerobot_latentsafe.world_models.perception import FrameBasis
+def until_switched(state: np.ndarray, command: np.ndarray, episode: np.ndarray) -> np.ndarray:
+    """How a state (N, M) changes until a command (N,) next falls below the middle of its range: (N, M).
 
-    return nn.ModuleList([FrameBasis(n_patches * token_dim // n_cameras, components) for _ in range(n_cameras)])
+    Zero where it does not fall any more in the episode (N,) of a frame.
+    """
+    closed = command < (command.min() + command.max()) / 2
+    falls = closed & np.append(True, ~closed[:-1]) & np.append(False, episode[1:] == episode[:-1])
+    index = np.arange(len(state))
+    at = np.minimum.accumulate(np.where(falls, index, len(state))[::-1])[::-1]  # the next fall of any episode
+    there = np.minimum(at, len(state) - 1)
+    known = (at < len(state)) & (episode[there] == episode)
+    return np.where(known[:, None], state[there] - state, 0.0).astype(np.float32)
 
 
-@torch.no_grad()
-def see(views: nn.ModuleList, tokens: Tensor) -> Tensor:
-    """Tokens (N, P, C) of all cameras -> their views side by side (N, n_cameras x components)."""
-    return torch.cat([view(part) for view, part in zip(views, tokens.float().chunk(len(views), -1))], -1)
-
-
-def with_views(cache_root: str | Path, repo_id: str, output_dir: str | Path, components: int = 64) -> "LeRobotDataset":
-    """Copy a token-cached dataset with what each camera's view of a frame is as a column that policies read.
+def with_aim(
+    cache_root: str | Path, repo_id: str, output_dir: str | Path, switch: str = "gripper.pos",
+    moved: Sequence[str] = ("ee_x.pos", "ee_y.pos", "ee_z.pos", "ee_rz.pos"),
+) -> "LeRobotDataset":  # fmt: skip
+    """Copy a token-cached dataset with the aim of each frame, learned from it, as a column that policies read.
 
     Args:
-        components: of each camera.
+        switch: the command whose falling, such as the fingers' closing, is aimed at.
+        moved: what of proprioception tells the motion until then.
 
     Raises:
         FrameCacheError: the cache holds no tokens.
+        ValueError: no such command, or it never falls.
     """
     from lerobot.datasets.dataset_tools import add_features
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -114,30 +186,38 @@ def with_views(cache_root: str | Path, repo_id: str, output_dir: str | Path, com
     from lerobot_latentsafe.datasets.frame_cache import FrameCache
     from lerobot_latentsafe.world_models.perception import PerceptionConfig
 
-    cache = FrameCache.open(cache_root)
+    cache, dataset = FrameCache.open(cache_root), LeRobotDataset(repo_id, root=cache_root)
     PerceptionConfig().adopt_cache(cache.manifest)
-    tokens = lambda rows: cache.frames(rows, ["tokens"])[0]["tokens"]  # noqa: E731
-    n = cache.manifest["n_frames"]
-    sample = tokens(np.sort(np.random.default_rng(0).permutation(n)[:SAMPLED_FRAMES]))
-    views = camera_views(len(cache.manifest["cameras"]), *sample.shape[1:], components)
+    names, states = (dataset.meta.features[key]["names"] for key in ("action", OBS_STATE))
+    if switch not in names or not {*moved} <= {*states}:
+        raise ValueError(
+            f"{repo_id} lacks {switch} or one of {', '.join(moved)}, from which to learn where to aim; its commands "
+            f"are {', '.join(names)}, its state {', '.join(states)}"
+        )
+    episode = np.asarray(dataset.hf_dataset.with_format("numpy")["episode_index"])
+    where = cache.state[:, [states.index(name) for name in moved]]
+    move = until_switched(where, cache.action[:, names.index(switch)], episode)
+    if not move.any():
+        raise ValueError(f"{switch} never falls in {repo_id}; record demonstrations that grasp something")
     torch.manual_seed(0)
-    for view, part in zip(views, sample.chunk(len(views), -1)):
-        view.fit(part)
-    seen = torch.cat([see(views, tokens(rows)) for rows in np.array_split(np.arange(n), max(1, n // 512))])
+    (percepts, state), n_cameras = cache.frames(np.arange(len(move)), ["tokens"]), len(cache.manifest["cameras"])
+    aim = Aim(n_cameras, *percepts["tokens"].shape[1:], state.shape[1], len(moved))
+    aim.fit(percepts["tokens"], state, torch.from_numpy(move))
+    with torch.no_grad():
+        seen = torch.cat([aim(*rows) for rows in zip(percepts["tokens"].split(512), state.split(512))])
     feature = {"dtype": "float32", "shape": (seen.shape[1],), "names": None}
-    dataset = LeRobotDataset(repo_id, root=cache_root)
     copy = add_features(
         dataset, {OBS_ENV_STATE: (seen.numpy(), feature)}, output_dir=output_dir, repo_id=f"{repo_id}_seen"
     )
-    save_file(views.state_dict(), Path(output_dir) / VIEWS)
+    save_file(aim.state_dict(), Path(output_dir) / AIM)
     return copy
 
 
-def let_see(checkpoint: str | Path, cache_root: str | Path, views: str | Path, output_dir: str | Path) -> None:
+def let_see(checkpoint: str | Path, cache_root: str | Path, seen: str | Path, output_dir: str | Path) -> None:
     """Write a policy that was trained on such a column so that it makes the column itself, from its cameras.
 
     Args:
-        views: the dataset that `with_views` made of the cache.
+        seen: the dataset that `with_aim` made of the cache.
 
     Raises:
         FileExistsError: output_dir exists.
@@ -154,10 +234,10 @@ def let_see(checkpoint: str | Path, cache_root: str | Path, views: str | Path, o
     manifest = FrameCache.open(cache_root).manifest
     config, cameras = PreTrainedConfig.from_pretrained(checkpoint), sorted(manifest["cameras"])
     step = PerceiveStep(
-        manifest["encoder"], manifest["encoder_hash"], config.env_state_feature.shape[0] // len(cameras),
-        manifest["image_size"], cameras,
+        manifest["encoder"], manifest["encoder_hash"], manifest["image_size"], cameras,
+        config.robot_state_feature.shape[0], config.env_state_feature.shape[0],
     )  # fmt: skip
-    step.load_state_dict(load_file(Path(views) / VIEWS))
+    step.load_state_dict(load_file(Path(seen) / AIM))
     pre, post = make_pre_post_processors(config, pretrained_path=checkpoint)
     # After images are batched and on the device, before anything is normalised.
     at = next(i for i, s in enumerate(pre.steps) if isinstance(s, DeviceProcessorStep)) + 1

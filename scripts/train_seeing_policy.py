@@ -3,8 +3,9 @@
 
     scripts/train_seeing_policy.py --dataset=data/bag_weak --output=outputs/bag_diffusion_weak [--steps=8000]
 
-Encodes the demonstrations, adds each camera's view to them, trains a policy on configs/bag_diffusion.yaml, and writes
-one that makes its view itself. What is done is skipped, and a killed training goes on from its last checkpoint.
+Encodes the demonstrations, learns to foresee in them where the fingers will close (see lerobot_latentsafe/perceive.py),
+trains a policy by configs/bag_diffusion.yaml on that, and writes one that sees it by itself. What is done is skipped,
+and a killed training goes on from its last checkpoint.
 
 It takes the steps of lerobot-train: the same configuration, policy, processors, optimiser and checkpoints. Only the
 windows come from memory: for a policy as small as this, LeRobot's loader takes most of the time.
@@ -28,7 +29,7 @@ from tqdm import trange
 
 from lerobot_latentsafe.datasets.frame_cache import FOLDER, MANIFEST
 from lerobot_latentsafe.datasets.windows import Windows
-from lerobot_latentsafe.perceive import VIEWS, let_see, with_views
+from lerobot_latentsafe.perceive import AIM, let_see, with_aim
 
 CONFIG = Path(__file__).parents[1] / "configs" / "bag_diffusion.yaml"
 
@@ -70,7 +71,6 @@ def main() -> None:
     parser.add_argument("--dataset", type=Path, required=True, help="folder of the demonstrations")
     parser.add_argument("--repo_id", help="of the demonstrations; by default latentsafe/<folder>")
     parser.add_argument("--output", type=Path, required=True)
-    parser.add_argument("--components", type=int, default=64, help="of each camera's view")
     parser.add_argument("--steps", type=int)
     parser.add_argument("--seed", type=int)
     arguments = parser.parse_args()
@@ -81,8 +81,8 @@ def main() -> None:
         command = [Path(sys.executable).parent / "latentsafe", "cache", "--encoder=auto"]
         command += [f"--dataset.repo_id={repo_id}", f"--dataset.root={arguments.dataset}"]
         subprocess.run([*map(str, command), f"--output_dir={beside['tokens']}"], check=True)
-    if not (beside["seen"] / VIEWS).exists():
-        with_views(beside["tokens"], f"{repo_id}_cache", beside["seen"], arguments.components)
+    if not (beside["seen"] / AIM).exists():
+        with_aim(beside["tokens"], f"{repo_id}_cache", beside["seen"])
     config = draccus.parse(TrainPipelineConfig, CONFIG, args=[])
     config.steps, config.seed = arguments.steps or config.steps, arguments.seed or config.seed
     dataset = LeRobotDataset(f"{repo_id}_cache_seen", root=beside["seen"])

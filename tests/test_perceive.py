@@ -7,16 +7,28 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import OBS_ENV_STATE
 
-from lerobot_latentsafe.datasets.frame_cache import FrameCache, FrameCacheError
-from lerobot_latentsafe.perceive import let_see, with_views
+from lerobot_latentsafe import perceive
+from lerobot_latentsafe.datasets.frame_cache import FrameCacheError
+from lerobot_latentsafe.envs.dubins import ACTION_NAMES, STATE_NAMES
+from lerobot_latentsafe.perceive import Aim, let_see, until_switched, with_aim
 from lerobot_latentsafe.shield import BasePolicy
+
+REPO_ID = tiny.REPO_ID + "_cache"
+AIMED = {"switch": ACTION_NAMES[0], "moved": STATE_NAMES}
+"""The car has no fingers: it aims at where it will next turn right."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_steps():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(perceive, "STEPS", 20)
+        yield
 
 
 @pytest.fixture(scope="module")
-def seen(token_root, tmp_path_factory):
-    """The dataset with the camera's views."""
-    root = tmp_path_factory.mktemp("views") / "seen"
-    return with_views(token_root, tiny.REPO_ID + "_cache", root, components=tiny.COMPONENTS)
+def seen(token_root, few_steps, tmp_path_factory):
+    """The dataset with the aim."""
+    return with_aim(token_root, REPO_ID, tmp_path_factory.mktemp("aim") / "seen", **AIMED)
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +40,7 @@ def seeing(token_root, seen, tmp_path_factory):
 
     folder = tmp_path_factory.mktemp("seeing")
     features = {"observation.state": PolicyFeature(FeatureType.STATE, (2,))}
-    features[OBS_ENV_STATE] = PolicyFeature(FeatureType.ENV, (tiny.COMPONENTS,))
+    features[OBS_ENV_STATE] = PolicyFeature(FeatureType.ENV, (2,))
     config = tiny.diffusion_config(input_features=features)
     one = torch.ones(2)
     stats = {key: {"min": -one, "max": one} for key in ("observation.state", "action")}
@@ -39,14 +51,30 @@ def seeing(token_root, seen, tmp_path_factory):
     return folder / "seeing"
 
 
-def test_views_keep_what_varies_among_frames(seen, token_root):
-    assert seen.meta.features[OBS_ENV_STATE]["shape"] == (tiny.COMPONENTS,)
-    cache = FrameCache.open(token_root)
-    rows = np.arange(0, cache.manifest["n_frames"], 3)
-    tokens = cache.frames(rows, ["tokens"])[0]["tokens"].float().flatten(1)
-    views = torch.stack([seen[int(i)][OBS_ENV_STATE] for i in rows])
-    apart, seen_apart = torch.pdist(tokens), torch.pdist(views)
-    assert torch.corrcoef(torch.stack([apart, seen_apart]))[0, 1] > 0.9
+def test_aim_is_at_the_next_fall_of_the_command_in_the_episode():
+    state = np.arange(10, dtype=np.float32)[:, None]
+    command = np.array([1, 1, 0, 0, 1, 0, 1, 1, 1, 0])
+    episode = np.array([0, 0, 0, 0, 0, 0, 1, 1, 1, 1])
+    assert until_switched(state, command, episode)[:, 0].tolist() == [2, 1, 0, 2, 1, 0, 3, 2, 1, 0]
+    command[9] = 1  # it does not fall any more
+    assert until_switched(state, command, episode)[6:, 0].tolist() == [0, 0, 0, 0]
+
+
+def test_what_is_learnt_of_an_object_in_some_places_holds_in_others():
+    """A bright patch is to be reached; the places of the test were never shown."""
+    patches, rng = torch.arange(36), np.random.default_rng(0)
+    places = torch.cartesian_prod(torch.linspace(-1, 1, 6), torch.linspace(-1, 1, 6))
+    shown = torch.from_numpy(rng.permutation(36)[:27])
+    tokens = torch.randn(36, 36, 4) * 0.05
+    tokens[patches, patches, 1] += 3
+    torch.manual_seed(0)
+    aim, state = Aim(1, 36, 4, state_dim=1, n_moves=2), torch.zeros(36, 1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(perceive, "STEPS", 400)
+        aim.fit(tokens[shown], state[shown], places[shown])
+    unseen = torch.from_numpy(np.setdiff1d(patches, shown))
+    error = (aim(tokens[unseen], state[unseen]) - places[unseen]).norm(dim=-1)
+    assert error.median() < 0.3  # patches are 0.4 apart, the picture is 2 wide
 
 
 def test_live_observation_is_seen_as_in_training(seeing, seen, dataset_root):
@@ -56,6 +84,13 @@ def test_live_observation_is_seen_as_in_training(seeing, seen, dataset_root):
     view = base.preprocessor(dict(batch))[OBS_ENV_STATE]
     torch.testing.assert_close(view[0], seen[7][OBS_ENV_STATE], rtol=1e-2, atol=1e-2)  # the cache holds 16 bits
     assert base.propose(batch).shape == (1, 2)
+
+
+def test_commands_that_cannot_be_aimed_at_are_named(token_root, tmp_path):
+    with pytest.raises(ValueError, match=r"lacks gripper\.pos"):
+        with_aim(token_root, REPO_ID, tmp_path / "seen")
+    with pytest.raises(ValueError, match=f"{ACTION_NAMES[1]} never falls"):
+        with_aim(token_root, REPO_ID, tmp_path / "seen", switch=ACTION_NAMES[1], moved=STATE_NAMES)
 
 
 def test_missing_camera_is_named(seeing):
@@ -70,4 +105,4 @@ def test_existing_folder_is_left_alone(seeing, seen, token_root):
 
 def test_pictures_are_no_views(cache_root, tmp_path):
     with pytest.raises(FrameCacheError, match="holds pictures"):
-        with_views(cache_root, tiny.REPO_ID + "_cache", tmp_path / "seen")
+        with_aim(cache_root, REPO_ID, tmp_path / "seen", **AIMED)

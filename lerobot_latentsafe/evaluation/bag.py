@@ -146,7 +146,12 @@ def _overrides(decisions: list[FilterDecision]) -> dict:
 
 
 def run_cells[Cell: Hashable](
-    path: Path, cells: dict[Cell, dict], n: int, run: Callable[[dict], dict], workers: int = 1
+    path: Path,
+    cells: dict[Cell, dict],
+    n: int,
+    run: Callable[[dict], dict],
+    workers: int = 1,
+    first_seed: int = FIRST_SEED,
 ) -> tuple[dict[Cell, list[dict]], dict]:
     """Episodes of all cells of a table from the same starts, each kept as it ends; see `run_resumable`.
 
@@ -154,11 +159,12 @@ def run_cells[Cell: Hashable](
         path: of the table that will be written; the file of episodes is beside it.
         cells: cell -> the job of its episodes, without their seed.
         n: episodes of a cell.
+        first_seed: of their starts.
 
     Returns:
         Cell -> its rows; and their provenance.
     """
-    seeds = range(FIRST_SEED, FIRST_SEED + n)
+    seeds = range(first_seed, first_seed + n)
     jobs = [{**job, "seed": seed} for job in cells.values() for seed in seeds]
     rows = run_resumable(path.with_suffix(".jsonl"), jobs, run, workers)
     runs = dict(zip(cells, map(list, batched(rows, n))))
