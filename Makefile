@@ -9,9 +9,11 @@ setup:
 demo: setup
 	$(PYTHON) scripts/demo.py
 
-# make demo-bag POLICY=<filter> BASE=<policy to be shielded>
+# The committed filter of the bag, or another, and a policy to be shielded if there is one:
+# make demo-bag POLICY=<filter> BASE=<policy>
+POLICY ?= bag
 demo-bag: setup
-	MUJOCO_GL=$${MUJOCO_GL:-egl} $(PYTHON) scripts/demo_bag.py --policy="$(POLICY)" --base="$(BASE)"
+	MUJOCO_GL=$${MUJOCO_GL:-egl} $(PYTHON) scripts/demo_bag.py --policy="$(POLICY)" $(if $(BASE),--base="$(BASE)")
 
 test: lint
 	HF_HUB_OFFLINE=1 $(PYTHON) -m pytest

@@ -1,7 +1,7 @@
 #!/usr/bin/env python
-"""A filter of the bag at work: a diffusion policy and operators, bare and shielded from the same starts.
+"""A filter of the bag at work: operators, and a policy if one is given, bare and shielded from the same starts.
 
-Nothing is trained. Runs scripts/bag_policies.py and scripts/bag_operators.py, small enough for two cores, and writes
+Nothing is trained. Runs scripts/bag_operators.py and scripts/bag_policies.py, small enough for two cores, and writes
 outputs/demo_bag/report.html and outputs/demo_bag/metrics.json. Numbers of full size are in results/bag.
 """
 
@@ -17,31 +17,39 @@ from lerobot_latentsafe.evaluation.demo import Demo
 OPERATORS = {"closed_end": "pulls the closed end up", "open_end": "lifts the open end"}
 
 
-def run(demo: Demo, filter: str, base: str, law: str, n: int) -> None:
-    """Both experiments, side by side on two cores."""
+def run(demo: Demo, filter: str, base: str | None, law: str, n: int) -> None:
+    """The experiments, side by side on two cores."""
     few = max(1, n // 2)
-    policies = (
-        f"diffusion policy: {n} starts, bare and shielded",
-        *("python", "scripts/bag_policies.py", f"--weak={base}", "--filters", filter, "--laws", law),
-        *(f"--n={n}", "--n_videos=3", f"--output={demo.out}/policies.json"),
-    )
-    operators = (
-        f"operators: {few} lifts by either end, bare and shielded",
-        *("python", "scripts/bag_operators.py", "--filters", filter, "--laws", law, "--operators"),
-        *(*OPERATORS, f"--n={few}", f"--output={demo.out}/operators.json"),
-    )
+    options = ("--filters", filter, "--laws", law)
+    steps = [
+        (
+            f"{name}: {few} lifts by an operator who {does}, bare and shielded",
+            *("python", "scripts/bag_operators.py", *options, "--operators", name),
+            *(f"--n={few}", f"--output={demo.out}/{name}.json"),
+        )
+        for name, does in OPERATORS.items()
+    ]
+    if base is not None:
+        steps.append((
+            f"policies: {n} starts of the policy, bare and shielded",
+            *("python", "scripts/bag_policies.py", f"--weak={base}", *options),
+            *(f"--n={n}", "--n_videos=3", f"--output={demo.out}/policies.json"),
+        ))  # fmt: skip
     with ThreadPoolExecutor(2) as cores:
-        for done in [cores.submit(demo.run, *step) for step in (policies, operators)]:
+        for done in [cores.submit(demo.run, *step) for step in steps]:
             done.result()
 
 
 def cells(out: Path, law: str) -> dict[str, dict]:
     """Who acted -> what came of it."""
-    policies, operators = (json.loads((out / f"{name}.json").read_text()) for name in ("policies", "operators"))
-    found = {"diffusion policy": policies["weak"]["bare"], "the same, shielded": policies["weak"][law]["pooled"]}
+    found = {}
+    if (out / "policies.json").exists():
+        policy = json.loads((out / "policies.json").read_text())["weak"]
+        found = {"policy": policy["bare"], "the same, shielded": policy[law]["pooled"]}
     for name, does in OPERATORS.items():
-        found[f"operator {does}"] = operators[name]["bare"]
-        found[f"the same operator ({name}), shielded"] = operators[name][law]["pooled"]
+        operator = json.loads((out / f"{name}.json").read_text())[name]
+        found[f"operator {does}"] = operator["bare"]
+        found[f"the same operator ({name}), shielded"] = operator[law]["pooled"]
     return found
 
 
@@ -56,8 +64,8 @@ def report(out: Path, law: str, seconds: float) -> None:
         ]
         for who, cell in found.items()
     ]  # fmt: skip
-    weak = json.loads((out / "policies.json").read_text())["weak"][law]
-    (p_value,) = (cell["paired_p"] for name, cell in weak.items() if name != "pooled")
+    lifts = json.loads((out / "closed_end.json").read_text())["closed_end"][law]
+    (p_value,) = (cell["paired_p"] for name, cell in lifts.items() if name != "pooled")
     kept = ("spilled", "success", "mean_share_lost", "overridden_share")
     metrics = {
         **{who: {key: cell[key] for key in kept if key in cell} for who, cell in found.items()},
@@ -70,25 +78,28 @@ def report(out: Path, law: str, seconds: float) -> None:
         "A latent safety filter keeps candies in an open bag",
         [
             html.paragraph(
-                "A robot should lift an open bag without spilling. A diffusion policy has learnt from careless "
-                "demonstrations, and an operator pulls as if the bag were sealed. The filter sees two cameras and the "
-                "arm's own state; it lets them act, and takes over when nothing else would keep the candies inside."
+                "A robot should lift an open bag without spilling, and an operator pulls as if the bag were sealed. "
+                "The filter sees two cameras and the arm's own state; it lets the operator act, and takes over when "
+                "nothing else would keep the candies inside. Who lifts the open end it should leave alone."
             ),
             html.heading("Bare and shielded from the same starts"),
             html.table(header, rows),
             html.paragraph(
-                "Shares with 95% Wilson intervals. Exact test of the paired difference of the policy's spills: "
-                f"p = {p_value:.1g}."
+                "Shares with 95% Wilson intervals. Exact test of the paired difference of the spills of lifts by the "
+                f"closed end: p = {p_value:.1g}."
             ),
             *(
                 html.video(path, "bare | shielded; orange: the filter acts")
                 for path in sorted(out.glob("videos/*.mp4"))
             ),
-            html.picture(out / "severity.png", "How many runs of the policy spill at least p% of the candies."),
+            *(
+                html.picture(path, "How many runs of the policy spill at least p% of the candies.")
+                for path in out.glob("severity.png")
+            ),
             html.heading("What the filter sees coming"),
-            html.picture(
-                out / "operators.png",
-                "V along operators' lifts. Orange: the filter acts. Grey lines: a candy first falls out.",
+            *(
+                html.picture(out / f"{name}.png", "V along lifts. Orange: the filter acts. Grey: a candy falls out.")
+                for name in OPERATORS
             ),
             html.paragraph(
                 "A few runs for a demonstration; results/bag holds the full ones. A learned filter is not a certified "
@@ -100,7 +111,7 @@ def report(out: Path, law: str, seconds: float) -> None:
     print()
     for row in [header, *rows]:
         print(f"{row[0]:<45}", *(f"{cell:<30}" for cell in row[1:]))
-    print(f"\nspills of the policy, bare against shielded: p = {p_value:.1g}")
+    print(f"\nspills of lifts by the closed end, bare against shielded: p = {p_value:.1g}")
     print(f"{metrics['minutes']} minutes. Open {out / 'report.html'}; numbers in {out / 'metrics.json'}")
 
 
@@ -111,12 +122,13 @@ def main() -> None:
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("outputs/demo_bag"))
-    parser.add_argument("--policy", required=True, help="the filter: a folder, a Hub id or a committed name")
-    parser.add_argument("--base", required=True, help="the policy to be shielded, likewise")
+    parser.add_argument("--policy", default="bag", help="the filter: a folder, a Hub id or a committed name")
+    parser.add_argument("--base", help="a policy to be shielded, likewise")
     parser.add_argument("--n", type=int, default=20, help="starts of the policy; operators get half as many")
     arguments = parser.parse_args()
     law = PreTrainedConfig.from_pretrained(resolve_checkpoint(arguments.policy)).law
-    resolve_checkpoint(arguments.base)
+    if arguments.base:
+        resolve_checkpoint(arguments.base)
     if arguments.out.exists():
         shutil.rmtree(arguments.out)
     demo = Demo(arguments.out)

@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# The filter of the bag and the policies it shields, from nothing, resumable: a step whose output exists is skipped.
+# The filter of the bag, the policies it shields and their experiments, from nothing, resumable: a step whose output
+# exists is skipped.
 #   scripts/reproduce_bag.sh [OUT]     OUT defaults to outputs/bag; recordings go to data, or to $DATA
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -34,6 +35,7 @@ filter() { # seed
     --output_dir="$OUT/margin_$1" --seed="$1"
   [ -e "$OUT/filter_$1/integrity.json" ] || $BIN/latentsafe train-reachability --policy.path="$OUT/margin_$1" $data \
     --output_dir="$OUT/filter_$1" --seeds="[$1]"
+  [ -e "$OUT/final_$1" ] || $BIN/latentsafe wrap --policy.path="$OUT/filter_$1" --output_dir="$OUT/final_$1" --half=true
 }
 
 record bag_mix bag_mix 0 400
@@ -60,7 +62,7 @@ for seed in $SEEDS; do
   filter "$seed"
   for held in branches lifts; do
     [ -e "results/bag/world_model_${held}_$seed.json" ] || $BIN/latentsafe eval-world-model \
-      --policy.path="$OUT/filter_$seed" --dataset.repo_id="latentsafe/held_${held}_cache" \
+      --policy.path="$OUT/final_$seed" --dataset.repo_id="latentsafe/held_${held}_cache" \
       --dataset.root="$DATA/held_${held}_tokens" --json="results/bag/world_model_${held}_$seed.json"
   done
 done
@@ -69,3 +71,10 @@ for kind in weak strong; do
   [ -e "$OUT/diffusion_$kind" ] || $BIN/python scripts/train_seeing_policy.py --dataset="$DATA/bag_$kind" \
     --output="$OUT/diffusion_$kind"
 done
+
+# The experiments: about 6 CPU-seconds an episode. Committed weights have names: bag is final_0.
+filters=$(for seed in $SEEDS; do echo "$OUT/final_$seed"; done)
+$BIN/python scripts/bag_operators.py --filters $filters --operators closed_end open_end --workers=2
+$BIN/python scripts/bag_policies.py --weak="$OUT/diffusion_weak" --strong="$OUT/diffusion_strong" --filters $filters \
+  --workers=2
+$BIN/python scripts/bag_out_of_distribution.py --filters $filters --workers=2

@@ -70,7 +70,7 @@ def script(monkeypatch):
 
 
 def test_policies_are_compared_operators_traced_and_the_demo_tells(script, filter_path, base_path, tmp_path, capsys):
-    policies, operators = tmp_path / "policies.json", tmp_path / "operators.json"
+    policies = tmp_path / "policies.json"
     options = [f"--weak={base_path}", "--filters", filter_path, "--laws", "margin", "--n=2", f"--output={policies}"]
     script("bag_policies", *options, "--n_videos=1").main()
     rows = json.loads(policies.read_text())
@@ -82,15 +82,20 @@ def test_policies_are_compared_operators_traced_and_the_demo_tells(script, filte
     script("bag_policies", *options).main()
     assert policies.with_suffix(".jsonl").read_text() == kept  # nothing was run again
 
-    given = ["--laws", "margin", "--operators", "closed_end", "open_end", "--n=1", f"--output={operators}"]
-    script("bag_operators", "--filters", filter_path, *given).main()
-    traces = json.loads(operators.read_text())["closed_end"]["traces"]
+    for operator in ("closed_end", "open_end"):
+        given = ["--laws", "margin", "--operators", operator, "--n=1", f"--output={tmp_path / operator}.json"]
+        script("bag_operators", "--filters", filter_path, *given).main()
+    traces = json.loads((tmp_path / "closed_end.json").read_text())["closed_end"]["traces"]
     assert len(traces) == 1 and len(traces[0]["value"]) == STEPS
 
     script("demo_bag").report(tmp_path, "margin", 90.0)
     page, numbers = (tmp_path / "report.html").read_text(), json.loads((tmp_path / "metrics.json").read_text())
-    assert page.count("<video") == 1 and page.count("<img") == 2 and "0/2 = 0.0%" in page
+    assert page.count("<video") == 1 and page.count("<img") == 3 and "0/2 = 0.0%" in page
     assert numbers["the same, shielded"]["overridden_share"] == 1.0 and "1.5 minutes" in capsys.readouterr().out
+    for file in (policies, tmp_path / "severity.png", *tmp_path.glob("videos/*.mp4")):  # without a policy
+        file.unlink()
+    script("demo_bag").report(tmp_path, "margin", 90.0)
+    assert (tmp_path / "report.html").read_text().count("<img") == 2
 
 
 def test_a_recording_is_replayed_on_every_variant(script, filter_path, tmp_path):

@@ -34,8 +34,8 @@ class Source:
             smaller ones keep the proportions. Episodes of different behaviours are interleaved.
         branches: episodes that start from each grasped state; 0 records whole episodes from the start.
         grasps: of those states, the shares in which the bag is held by its closed end, middle and open end.
-        astray: share of episodes that start with the arm astray above the bag instead of at home: demonstrations that
-            all go straight to the bag never show a policy how to correct itself.
+        astray: share of episodes that start with the arm astray instead of at home: demonstrations that all go straight
+            to the bag never show a policy how to correct itself.
     """
 
     scene: str
@@ -60,8 +60,8 @@ SOURCES: dict[str, Source] = {
     "bag_branches": Source("bag", {"branch": 500}, branches=5),
     "bag_climbs": Source("bag", {"climb": 200}, branches=4, grasps=(0.5, 0.1, 0.4)),
     "bag_lifts": Source("bag", {"rise": 200}, branches=1, grasps=(0.5, 0.0, 0.5)),
-    "bag_strong": Source("bag", {"middle": 100}, astray=0.7),
-    "bag_weak": Source("bag", {"closed_end": 100}, variant="sealed", astray=0.7),
+    "bag_strong": Source("bag", {"middle": 100}, astray=0.8),
+    "bag_weak": Source("bag", {"closed_end": 100}, variant="sealed", astray=0.8),
     "blocks_demos": Source("blocks", {"pluck_careful": 120, "pluck_careless": 80}),
     "blocks_random": Source("blocks", {"random": 200}),
 }
@@ -156,7 +156,7 @@ def _record_part(source: Source, repo_id: str, root: Path, episodes: range, seed
 
 def episode_frames(robot: "LatentSafeFrankaMujoco", source: Source, episode: int, seed: int) -> Iterator[dict]:
     """The frames of an episode as `LeRobotDataset.add_frame` takes them; the first failing frame and all after fail."""
-    from lerobot_latentsafe.teleoperators.scripted.behaviors import stray
+    from lerobot_latentsafe.teleoperators.scripted.behaviors import GRASPED, stray
     from lerobot_latentsafe.teleoperators.scripted.config_scripted import LatentSafeScriptedConfig
     from lerobot_latentsafe.teleoperators.scripted.scripted import LatentSafeScripted
 
@@ -168,7 +168,7 @@ def episode_frames(robot: "LatentSafeFrankaMujoco", source: Source, episode: int
         n_frames -= _grasp(robot, _scene_seed(seed, start), source.grasps)
     rng = np.random.default_rng([8, _scene_seed(seed, start)])
     if rng.random() < source.astray:
-        _go(robot, stray(scene, rng))
+        _go(robot, stray(scene, GRASPED[source.behavior(episode)], rng))
     operator = LatentSafeScripted(LatentSafeScriptedConfig(behavior=source.behavior(episode), seed=episode))
     failed = False
     with operator:

@@ -54,21 +54,28 @@ def _turn_to(scene: FrankaScene, yaw: float) -> float:
 
 # The bag
 
+GRASPED = {"open_end": bag.MOUTH, "middle": bag.MIDDLE, "closed_end": bag.TAIL}
+"""Behaviour -> the segment that it lifts the bag by."""
+
 
 def grasp(scene: bag.BagScene, segment: int, rng: np.random.Generator) -> Actions:
     """Close the fingers on a segment of the bag."""
     above = scene.segment_position(segment) + np.append(rng.normal(0, 0.003, 2), 0)
     yaw = scene.yaw + rng.normal(0, 0.05)
-    yield from reach(scene, np.append(above[:2], 0.12), MAX_SPEED, OPEN, yaw)
+    height = np.clip(scene.controller.position[2], 0.05, 0.12)  # a hand that is low already is put right down there
+    yield from reach(scene, np.append(above[:2], height), MAX_SPEED, OPEN, yaw)
     yield from reach(scene, np.append(above[:2], 0.028), 0.3, OPEN)
     yield from hold(CLOSED, 9)
 
 
-def stray(scene: bag.BagScene, rng: np.random.Generator) -> Actions:
-    """Go somewhere above the bag, turned at random: where a policy may find itself that went astray."""
-    above = scene.segment_position(bag.MIDDLE)[:2] + rng.uniform(-0.12, 0.12, 2)
-    yaw = scene.yaw + rng.uniform(-0.8, 0.8)
-    yield from reach(scene, np.append(above, rng.uniform(0.07, 0.25)), MAX_SPEED, OPEN, yaw)
+def stray(scene: bag.BagScene, segment: int, rng: np.random.Generator) -> Actions:
+    """Go where a policy may find itself that went astray: above the bag, or low and close to the segment it wants."""
+    if rng.random() < 0.4:
+        near, aside, height, turn = bag.MIDDLE, 0.12, rng.uniform(0.12, 0.25), 0.8
+    else:
+        near, aside, height, turn = segment, 0.05, rng.uniform(0.04, 0.12), 0.4
+    above = scene.segment_position(near)[:2] + rng.uniform(-aside, aside, 2)
+    yield from reach(scene, np.append(above, height), MAX_SPEED, OPEN, scene.yaw + rng.uniform(-turn, turn))
 
 
 def lift(scene: bag.BagScene, segment: int, speed: float, rng: np.random.Generator) -> Actions:
