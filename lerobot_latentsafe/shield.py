@@ -154,13 +154,12 @@ class Shield:
         for key in model.world_model.image_keys:
             image = observation[key].to(model.device)
             check_proportions(key, tuple(image.shape[1:]), config.input_features[key].shape)
-            finite &= torch.isfinite(image).flatten(1).all(1)
-            in_range = (image >= -1e-3).flatten(1).all(1) & (image <= 1 + 1e-3).flatten(1).all(1)
-            finite &= in_range
-            images[key] = model.model_images(image.nan_to_num(0.0).clamp(0, 1))
+            low, high = torch.aminmax(image.flatten(1), dim=1)  # NaN if anything is
+            usable = torch.isfinite(low) & torch.isfinite(high) & (low >= -1e-3) & (high <= 1 + 1e-3)
+            finite &= usable
+            images[key] = model.model_images(image if usable.all() else image.nan_to_num(0.0).clamp(0, 1)).clamp(0, 1)
             # A camera that delivers one flat colour is covered or dead.
-            flat = (image.flatten(1).amax(1) - image.flatten(1).amin(1)) < 1e-3
-            fault = _first_fault(fault, flat, Reason.OBSERVATION_MISSING)
+            fault = _first_fault(fault, high - low < 1e-3, Reason.OBSERVATION_MISSING)
         fault = _first_fault(fault, ~finite, Reason.OBSERVATION_NOT_FINITE)
         if age_s > 1.0 / config.fps or not age_s >= 0:
             fault = _first_fault(fault, torch.ones_like(finite), Reason.OBSERVATION_STALE)
