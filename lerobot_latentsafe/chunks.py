@@ -49,8 +49,8 @@ class ChunksAhead:
         if not self._playing:
             if self._next is None:
                 self._begin()
-            chunk, self._next = self._next.result(), None
-            self._playing.extend(chunk.unbind(1)[self._ticks :])
+            begun, self._next = self._next, None  # what went wrong is raised once
+            self._playing.extend(begun.result().unbind(1)[self._ticks :])
         action = self._playing.popleft()
         if len(self._playing) <= self.ahead and self._next is None:
             self._begin()

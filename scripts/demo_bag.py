@@ -116,9 +116,7 @@ def report(out: Path, law: str, seconds: float) -> None:
 
 
 def main() -> None:
-    from lerobot.configs.policies import PreTrainedConfig
-
-    from lerobot_latentsafe.checkpoint import resolve_checkpoint
+    from lerobot_latentsafe.checkpoint import read_config, resolve_checkpoint
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("outputs/demo_bag"))
@@ -126,7 +124,7 @@ def main() -> None:
     parser.add_argument("--base", help="a policy to be shielded, likewise")
     parser.add_argument("--n", type=int, default=20, help="starts of the policy; operators get half as many")
     arguments = parser.parse_args()
-    law = PreTrainedConfig.from_pretrained(resolve_checkpoint(arguments.policy)).law
+    law = read_config(resolve_checkpoint(arguments.policy)).law
     if arguments.base:
         resolve_checkpoint(arguments.base)
     if arguments.out.exists():

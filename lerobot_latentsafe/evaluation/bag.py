@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_latentsafe.checkpoint import WEIGHTS, resolve_checkpoint
+from lerobot_latentsafe.checkpoint import WEIGHTS, read_config, resolve_checkpoint
 from lerobot_latentsafe.envs.bag import BagScene
 from lerobot_latentsafe.envs.franka import CAMERAS
 from lerobot_latentsafe.evaluation.rollouts import paired_p_value, provenance, run_resumable, wilson
@@ -44,9 +44,7 @@ class FilterSetting:
     @classmethod
     def of(cls, path: str, law: str, epsilon: float | None = None, guard: int | None = None) -> "FilterSetting":
         """Epsilon and guard are the filter's own unless given."""
-        from lerobot.configs.policies import PreTrainedConfig
-
-        own = PreTrainedConfig.from_pretrained(resolve_checkpoint(path))
+        own = read_config(resolve_checkpoint(path))
         epsilon, guard = own.epsilon if epsilon is None else epsilon, own.guard if guard is None else guard
         return cls(path, law, epsilon, guard, fingerprint(path))
 
