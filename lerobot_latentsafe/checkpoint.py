@@ -2,6 +2,8 @@
 
 import hashlib
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -61,6 +63,19 @@ def read_config(folder: Path) -> "PreTrainedConfig":
         return PreTrainedConfig.from_pretrained(folder)
     except (OSError, ValueError, draccus.utils.DecodingError) as e:
         raise CheckpointError(f"{folder / 'config.json'} is missing or not readable ({e})") from e
+
+
+@contextmanager
+def fitting_weights(folder: Path) -> Iterator[None]:
+    """Name the checkpoint whose weights do not fit its configuration, where they are loaded.
+
+    Raises:
+        CheckpointError: naming the folder.
+    """
+    try:
+        yield
+    except RuntimeError as e:
+        raise CheckpointError(f"weights of {folder} do not fit its config.json: {e}") from e
 
 
 def _digest(file: Path) -> str:

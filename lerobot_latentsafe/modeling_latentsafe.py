@@ -12,7 +12,14 @@ import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor
 
-from lerobot_latentsafe.checkpoint import CheckpointError, check_sealed, read_config, resolve_checkpoint, seal
+from lerobot_latentsafe.checkpoint import (
+    CheckpointError,
+    check_sealed,
+    fitting_weights,
+    read_config,
+    resolve_checkpoint,
+    seal,
+)
 from lerobot_latentsafe.configuration_latentsafe import STAGES, LatentSafeConfig
 from lerobot_latentsafe.datasets.clips import ClipReader
 from lerobot_latentsafe.datasets.frame_cache import to_model_images
@@ -307,10 +314,8 @@ class LatentSafePolicy(PreTrainedPolicy):
         check_sealed(folder)
         if config.base_policy_path == BASE_FOLDER and (folder / BASE_FOLDER).is_dir():
             config.base_policy_path = str(folder / BASE_FOLDER)
-        try:
+        with fitting_weights(folder):
             return super().from_pretrained(folder, config=config, strict=True, **kwargs)
-        except RuntimeError as e:
-            raise CheckpointError(f"weights of {folder} do not fit its config.json: {e}") from e
 
     def generate_model_card(self, dataset_repo_id: str, model_type: str, license: str | None,
                             tags: list[str] | None, cfg=None, dataset_meta=None):  # fmt: skip

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lerobot_latentsafe.baselines.dreamer.behavior import Actor, ReturnRange, TwoHotHead, imagine, lambda_returns
 from lerobot_latentsafe.baselines.dreamer.configuration_dreamer import LatentSafeDreamerConfig
-from lerobot_latentsafe.checkpoint import CheckpointError, read_config, resolve_checkpoint
+from lerobot_latentsafe.checkpoint import CheckpointError, fitting_weights, read_config, resolve_checkpoint
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, UntrainedFilterError
 from lerobot_latentsafe.world_models.base import Clip, Latent
 
@@ -172,10 +172,8 @@ class LatentSafeDreamerPolicy(PreTrainedPolicy):
             raise CheckpointError(f"{pretrained_name_or_path} is a {config.type!r} policy, expected latentsafe_dreamer")
         if config.world_model_path == WORLD_MODEL_FOLDER:
             config.world_model_path = str(folder / WORLD_MODEL_FOLDER)
-        try:
+        with fitting_weights(folder):
             return super().from_pretrained(folder, config=config, strict=True, **kwargs)
-        except RuntimeError as e:
-            raise CheckpointError(f"weights of {folder} do not fit its config.json: {e}") from e
 
     def generate_model_card(self, dataset_repo_id: str, model_type: str, license: str | None,
                             tags: list[str] | None, cfg=None, dataset_meta=None):  # fmt: skip
