@@ -1,7 +1,8 @@
 #!/usr/bin/env python
 """How good the failure margin gets with few labels: episodes labelled at random, or in the order the page suggests.
 
-    scripts/label_curve.py --policy=<world model> --repo_id=latentsafe/dubins_random_cache --root=data/car_cache
+    scripts/label_curve.py --policy=<world model> --repo_id=latentsafe/dubins_random_cache --root=data/car_cache \\
+        --output=results/labels/curve_car.json
     scripts/label_curve.py --policy=<world model> --repo_id=latentsafe/bag_cache --root=data/bag_tokens \\
         --output=results/labels/curve_bag.json
 
@@ -14,7 +15,10 @@ frame. All curves of the output's folder are drawn into curve.png beside them.
 
 import argparse
 import dataclasses
+import itertools
 import json
+import os
+from multiprocessing import get_context
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -39,6 +43,8 @@ BLOCK = 10
 class Study:
     """Features of a labelled dataset under a frozen world model: as if any share of the episodes had been labelled.
 
+    All of it is NumPy's, so that it can be sent to other processes.
+
     Attributes:
         seen: (N, D) of every frame, filtered from the first frame of its episode: what is asked about.
         features, frame: (M, D) seen and imagined ones of random windows, (M,) their frames: what is fitted to.
@@ -60,26 +66,28 @@ class Study:
         episodes = np.arange(len(self.first))
         self.pool = episodes[episodes // BLOCK % 5 < 4]
         self.held_out = ~np.isin(self.episode, self.pool)
-        self.seen = encode(policy, reader, self.first)
+        self.seen = encode(policy, reader, self.first).numpy()
         # A frame's number stands in for its label, so that labels can be put on and taken off later.
         numbered = dataclasses.replace(labels, failure=np.arange(len(self.failure)))
         numbers = ClipReader(numbered, reader.cache, reader.length)
         generator = torch.Generator().manual_seed(0)
-        self.features, self.frame = seen_and_imagined(policy, numbers, self.config.margin_clips, generator)
+        imagined = seen_and_imagined(policy, numbers, self.config.margin_clips, generator)
+        self.features, self.frame = (column.cpu().numpy() for column in imagined)
 
     def fit(self, labelled: np.ndarray, seed: int) -> np.ndarray:
         """Bounded margin (N,) of every frame, after labelling some episodes."""
         torch.manual_seed(seed)
         generator = torch.Generator().manual_seed(seed)
         margin = FailureMargin(self.seen.shape[1], self.config.margin_hidden, self.config.margin_layers)
-        known = torch.from_numpy(np.isin(self.episode, labelled))[self.frame]
-        failure = torch.from_numpy(self.failure)[self.frame[known]]
-        fit_margin(margin, self.features[known], failure, self.config.margin_delta, generator)
+        known = np.isin(self.episode, labelled)[self.frame]
+        features, failure = map(torch.from_numpy, (self.features[known], self.failure[self.frame[known]]))
+        fit_margin(margin, features, failure, self.config.margin_delta, generator)
         with torch.no_grad():
-            return margin.bounded(self.seen).numpy()
+            return margin.bounded(torch.from_numpy(self.seen)).numpy()
 
     def curve(self, suggested: bool, seed: int) -> dict[str, float]:
         """Balanced accuracy on held-out frames after each round; what is labelled first is random either way."""
+        torch.set_num_threads(1)
         order, margin, scores = np.random.default_rng(seed).permutation(self.pool), None, {}
         labelled = 0
         for share in SHARES:
@@ -130,19 +138,21 @@ def main() -> None:
     parser.add_argument("--repo_id", required=True)
     parser.add_argument("--root", required=True)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--output", type=Path, default=Path("results/labels/curve_dubins.json"))
+    parser.add_argument("--workers", type=int, default=1, help="processes")
+    parser.add_argument("--output", type=Path, required=True)
     arguments = parser.parse_args()
-    torch.set_num_threads(1)
 
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
     meta = LeRobotDatasetMetadata(arguments.repo_id, root=arguments.root)
     policy, reader = load_with_cache(arguments.policy, meta)
     study = Study(policy, reader)
-    curves = {
-        order: [study.curve(order == "suggested", seed) for seed in arguments.seeds]
-        for order in ("random", "suggested")
-    }
+    jobs = [(suggested, seed) for suggested in (False, True) for seed in arguments.seeds]
+    with get_context("spawn").Pool(arguments.workers) as pool:
+        rows = pool.starmap(study.curve, jobs, chunksize=1)
+        pool.close()
+        pool.join()
+    curves = dict(zip(("random", "suggested"), itertools.batched(rows, len(arguments.seeds))))
     for order, rows in curves.items():
         print(order, {share: f"{np.mean([row[share] for row in rows]):.4f}" for share in rows[0]})
     row = {
@@ -150,7 +160,7 @@ def main() -> None:
         "lost_with_a_tenth": {o: float(np.mean([r["1"] - r["0.1"] for r in rows])) for o, rows in curves.items()},
         "labels_shaped_the_features": policy.config.margin_weight > 0,
         "episodes": len(study.pool),
-        **provenance(arguments.seeds),
+        **provenance(arguments.seeds, sum(os.times()[:4]) / 60),
     }
     write_json(arguments.output, row)
     save(draw(sorted(arguments.output.parent.glob("curve_*.json"))), arguments.output.with_name("curve.png"))

@@ -4,6 +4,7 @@ import json
 import os
 import platform
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -69,18 +70,24 @@ def confusion(predicted_safe: np.ndarray, truly_safe: np.ndarray) -> dict[str, f
 
 def provenance(seeds: list[int], cpu_minutes: float | None = None) -> dict:
     """What every results file carries: command, commit, seeds, CPU minutes, machine, date."""
-    head = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], cwd=Path(__file__).parent, capture_output=True, text=True
-    )
     minutes = (time.process_time() - _STARTED) / 60 if cpu_minutes is None else cpu_minutes
     return {
         "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
-        "commit": head.stdout.strip() or "unknown",
+        "commit": _commit(),
         "seeds": seeds,
         "cpu_minutes": round(minutes, 2),
         "machine": f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}",
         "date": date.today().isoformat(),
     }
+
+
+def _commit() -> str:
+    """Of the working tree this package lies in; unknown where there is none, or no git."""
+    if not shutil.which("git"):
+        return "unknown"
+    command = ["git", "rev-parse", "--short", "HEAD"]
+    head = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True)
+    return head.stdout.strip() or "unknown"
 
 
 def write_json(path: str | Path, content: dict) -> None:
