@@ -38,4 +38,4 @@ def hinge_loss(margin: Tensor, failure: Tensor, delta: float = 0.75) -> Tensor:
     """
     safe, failing = failure == 0, failure == 1
     n_safe, n_failing = mean_over_ranks(torch.stack([safe.sum(), failing.sum()])).clamp(min=1e-6)
-    return F.relu(delta - margin[safe]).sum() / n_safe + F.relu(delta + margin[failing]).sum() / n_failing
+    return (F.relu(delta - margin) * safe).sum() / n_safe + (F.relu(delta + margin) * failing).sum() / n_failing

@@ -167,9 +167,9 @@ class LatentSafePolicy(PreTrainedPolicy):
         if self.device.type == "cpu":
             keep_freed_memory()
         loss, _, metrics = self.clip_loss(self.reader.read(batch, self))
-        return loss, metrics
+        return loss, {name: float(value) for name, value in metrics.items()}
 
-    def clip_loss(self, clip: Clip) -> tuple[Tensor, Tensor, dict[str, float]]:
+    def clip_loss(self, clip: Clip) -> tuple[Tensor, Tensor, dict[str, Tensor | float]]:
         """The loss of a clip, the features (B, T, D) of its frames, and metrics."""
         loss, features, metrics = self.world_model.loss(clip)
         margin = self.margin(features)
@@ -177,11 +177,10 @@ class LatentSafePolicy(PreTrainedPolicy):
         margin_loss = hinge_loss(margin, failure, self.config.margin_delta)
         loss = loss + self.config.margin_weight * margin_loss
         labelled = failure >= 0
-        correct = ((margin < 0) == (failure == 1))[labelled].float().mean()
+        correct = (((margin < 0) == (failure == 1)) & labelled).sum() / labelled.sum()
         if self.training:
             self.config.stage = STAGES[1]
-        metrics |= {"loss_margin": margin_loss.item(), "margin_accuracy": correct.item()}
-        return loss, features, metrics
+        return loss, features, {**metrics, "loss_margin": margin_loss, "margin_accuracy": correct}
 
     def value(self, latent: Latent) -> Tensor:
         """V(z) of latents (B, ...) -> (B,); see `plan`."""

@@ -33,7 +33,7 @@ def test_shapes(model):
 def test_loss_returns_features_for_the_margin_and_finite_metrics(model):
     loss, features, metrics = model.loss(tiny.random_clip(batch=3, length=5))
     assert loss.isfinite() and features.shape == (3, 5, model.feature_dim)
-    assert all(isinstance(v, float) and v == v for v in metrics.values())
+    assert all(v.isfinite() for v in metrics.values())
 
 
 def test_loss_decreases_on_one_batch():

@@ -145,7 +145,7 @@ class WorldModel(nn.Module, abc.ABC):
         """How far a latent is from what was then seen: squared error (B,), in a unit of the model's own."""
 
     @abc.abstractmethod
-    def loss(self, clip: Clip) -> tuple[Tensor, Tensor, dict[str, float]]:
+    def loss(self, clip: Clip) -> tuple[Tensor, Tensor, dict[str, Tensor | float]]:
         """Training loss, features (B, T, D) of the posterior for the co-trained margin, and metrics."""
 
     def observe(

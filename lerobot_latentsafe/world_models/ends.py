@@ -4,7 +4,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from lerobot_latentsafe.ranks import any_rank, mean_over_ranks
+from lerobot_latentsafe.ranks import mean_over_ranks
 from lerobot_latentsafe.world_models.base import Clip, Latent, WorldModel
 
 
@@ -25,7 +25,7 @@ class EndAware(WorldModel):
         """Cross-entropy of the head, which teaches the features nothing."""
         known = (clip.terminal >= 0) & clip.valid
         if self.training:
-            self.ends_seen += any_rank((clip.terminal[known] == 1).any())
-        logits, goes_on = self.continues(features.detach()).squeeze(-1)[known], (clip.terminal[known] == 0).float()
-        error = F.binary_cross_entropy_with_logits(logits, goes_on, reduction="sum")
+            self.ends_seen += mean_over_ranks(((clip.terminal == 1) & known).any()) > 0
+        logits, goes_on = self.continues(features.detach()).squeeze(-1), (clip.terminal == 0).float()
+        error = F.binary_cross_entropy_with_logits(logits, goes_on, known.float(), reduction="sum")
         return error / mean_over_ranks(known.sum()).clamp(min=1e-6)

@@ -247,7 +247,7 @@ class RSSM(EndAware):
 
     # -- learning ---
 
-    def loss(self, clip: Clip) -> tuple[Tensor, Tensor, dict[str, float]]:
+    def loss(self, clip: Clip) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
         """Reconstruction + balanced KL + continuation; samples x so that the model is trained as a distribution."""
         if self.training:
             self._update_mean_image(clip)
@@ -274,8 +274,7 @@ class RSSM(EndAware):
             + self.config.representation_scale * kl_representation
             + self.end_loss(features, clip)
         )
-        metrics = {key: value.item() for key, value in error.items()}
-        return loss, features, {**metrics, "loss_state": error_state.item(), "kl": kl.item()}
+        return loss, features, {**error, "loss_state": error_state, "kl": kl}
 
     def _filter_sampled(self, embedding: Tensor, clip: Clip) -> list[Tensor]:
         """h, x and the posterior's statistics of every frame: (B, T, ...) each."""
@@ -306,9 +305,8 @@ class RSSM(EndAware):
     @torch.no_grad()
     def _update_mean_image(self, clip: Clip, settle_after: int = 200) -> None:
         """Running mean image of the first batches, which the encoder subtracts and the decoder adds."""
-        if self.mean_count >= settle_after:
-            return
-        self.mean_count += 1
+        settling = self.mean_count < settle_after
+        self.mean_count += settling
         for key, name in self.cameras.items():
             mean = getattr(self, f"mean_{name}")
-            mean.lerp_(mean_over_ranks(clip.percepts[key].mean((0, 1))), float(1 / self.mean_count))
+            mean.lerp_(mean_over_ranks(clip.percepts[key].mean((0, 1))), settling / self.mean_count)

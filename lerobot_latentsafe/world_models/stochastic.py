@@ -4,7 +4,6 @@ A network's raw output (..., n_raw) is read into statistics, a tuple of tensors,
 """
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from lerobot_latentsafe.ranks import rand_like, randn_like
@@ -67,4 +66,4 @@ class Categorical:
         return (of[0] * (of[0].log() - to[0].log())).sum((-2, -1))
 
     def _one_hot(self, classes: Tensor) -> Tensor:
-        return F.one_hot(classes, self.classes).float().flatten(-2)
+        return (classes[..., None] == torch.arange(self.classes, device=classes.device)).float().flatten(-2)
