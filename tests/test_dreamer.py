@@ -2,7 +2,9 @@
 
 import json
 import shutil
+from multiprocessing.pool import ThreadPool
 from pathlib import Path
+from types import SimpleNamespace
 
 import draccus
 import numpy as np
@@ -12,6 +14,7 @@ import torch
 from safetensors.torch import load_file
 from test_hub import hub  # noqa: F401
 
+from lerobot_latentsafe.baselines.dreamer import recorders
 from lerobot_latentsafe.baselines.dreamer.modeling_dreamer import LatentSafeDreamerPolicy, WorldModelMismatchError
 from lerobot_latentsafe.baselines.dreamer.replay import CAMERA_KEYS, Replay
 from lerobot_latentsafe.baselines.dreamer.training import DreamerTraining, TrainDreamer
@@ -83,6 +86,19 @@ def test_a_killed_run_ends_as_one_that_was_not(trained, tmp_path):
         np.testing.assert_array_equal(*(np.load(f / "replay" / f"{name}.npy") for f in (folder, trained)))
 
 
+def test_other_workers_record_the_same_episodes(monkeypatch):
+    monkeypatch.setattr(recorders, "get_context", lambda method: SimpleNamespace(Pool=ThreadPool))
+    episodes = []
+    for workers in (0, 1):
+        those = recorders.Recorders(seed=3, image_size=16, workers=workers)
+        episodes.append(list(those([0, 1], None)))
+        those.close()
+    for here, there in zip(*episodes):
+        assert here.keys() == there.keys()
+        for name in here:
+            np.testing.assert_array_equal(here[name], there[name])
+
+
 def test_resuming_with_other_options_is_refused(trained):
     with pytest.raises(ValueError, match="run with other options \\(batch_size\\)"):
         DreamerTraining(tiny.dreamer_options(trained, batch_size=5))
@@ -110,19 +126,22 @@ def test_all_parts_learn(trained, tmp_path):
 def test_batches_hold_a_tenth_of_demonstrations(trained):
     run = DreamerTraining(tiny.dreamer_options(trained))
     run.step, run.options.batch_size = 5, 20
-    clip, reward, demonstrated = run._batch()
-    assert demonstrated.sum() == 2 and reward.shape == clip.valid.shape == (20, 6)
+    reward, demonstrated, starts, weights, *clip = run._batch()
+    valid = clip[5]
+    assert demonstrated.sum() == 2 and reward.shape == valid.shape == (20, 6)
+    assert valid.flatten()[starts].all() and weights.tolist() == pytest.approx([1.0, 0.1])
     run.step = 2  # before the policy has episodes
-    assert run._batch()[2].all()
+    _, demonstrated, _, weights, *_ = run._batch()
+    assert demonstrated.all() and weights.tolist() == [0.0, 1.0]
 
 
 def test_rewards_are_those_of_the_frames(trained):
     run = DreamerTraining(tiny.dreamer_options(trained))
     run.step = 0
-    clip, reward, _ = run._batch()
+    reward, _, _, _, *clip = run._batch()
     terms = run.replay.arrays["terms"]
     every = run.policy.config.behavior.rewards.reward(torch.from_numpy(terms[: 2 * tiny.BLOCKS_FRAMES]))
-    for row, valid in zip(reward, clip.valid):
+    for row, valid in zip(reward, clip[5]):
         kept = row[valid]
         windows = every.unfold(0, len(kept), 1)
         assert (windows - kept).abs().amax(1).min() < 1e-6
@@ -267,5 +286,5 @@ def test_pulled_policy_acts_as_the_pushed_one(hub, task_policy, trained):  # noq
 
 def test_log_counts_outcomes_of_each_round(trained):
     rows = [json.loads(line) for line in (trained / "log.jsonl").read_text().splitlines()]
-    rounds = [row for row in rows if "round" in row]
-    assert [row["round"] for row in rounds] == [0, 1] and all(0 <= row["violation"] <= 2 for row in rounds)
+    rounds = [row for row in rows if "episodes" in row]
+    assert [row["episodes"] for row in rounds] == [4, 6] and all(0 <= row["violation"] <= 2 for row in rounds)

@@ -90,10 +90,11 @@ def actor():
     return Actor(3, torch.tensor([True, False]), CONFIG)
 
 
-def test_actor_moves_only_what_varies_and_stays_in_range(actor):
+def test_actor_moves_only_what_varies_and_its_mode_stays_in_range(actor):
     features = 10 * torch.randn(200, 3)
+    assert actor.mode(features).abs().max() <= 1
     for action in (actor.mode(features), actor.sample(features)):
-        assert action.shape == (200, 2) and action.abs().max() <= 1
+        assert action.shape == (200, 2)
         assert action[:, 1].eq(0).all() and action[:, 0].ne(0).any()
 
 
@@ -120,3 +121,19 @@ def test_imagination_pairs_actions_with_the_latents_they_lead_to(actor):
     features, actions = imagine(Counter(), actor, {"x": torch.zeros(4, 3)}, 5)
     assert features.shape == (6, 4, 3) and actions.shape == (5, 4, 2)
     assert features[:, 0, 0].tolist() == [0, 1, 2, 3, 4, 5]
+
+
+def test_what_is_imagined_to_be_executed_is_in_range():
+    actor = Actor(3, torch.tensor([True, True]), BehaviorConfig(hidden=32, bins=41, min_std=1.0))
+
+    class Recorder(Counter):
+        executed = ()
+
+        def sample_step(self, latent, action):
+            self.executed += (action,)
+            return super().sample_step(latent, action)
+
+    world = Recorder()
+    _, drawn = imagine(world, actor, {"x": 10 * torch.randn(200, 3)}, 2)
+    torch.testing.assert_close(torch.stack(world.executed), drawn.clamp(-1, 1))
+    assert drawn.abs().max() > 1

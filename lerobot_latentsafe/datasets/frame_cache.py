@@ -86,13 +86,13 @@ class FrameCache:
     """Memory-mapped percepts of a dataset by frame index.
 
     Attributes:
-        percepts: name -> (N, ...): uint8 pictures, or float16, float32 or int8 numbers.
+        percepts: name -> (N, ...): uint8 pictures, or float16, float32 or int8 numbers; may be tensors of any device.
         scales: name -> float16 (N, ..., 1), what int8 numbers are multiplied by.
         state: float32 (N, S); action: float32 (N, A) in robot units, taken *after* each frame.
         manifest: what it was made from.
     """
 
-    percepts: dict[str, np.ndarray]
+    percepts: dict[str, np.ndarray | Tensor]
     scales: dict[str, np.ndarray]
     state: np.ndarray
     action: np.ndarray
@@ -149,7 +149,7 @@ class FrameCache:
         return {name: self._read(name, index) for name in names or self.percepts}, torch.from_numpy(self.state[index])
 
     def _read(self, name: str, index: np.ndarray) -> Tensor:
-        numbers = torch.from_numpy(self.percepts[name][index])
+        numbers = torch.as_tensor(self.percepts[name][index])
         if numbers.dtype == torch.uint8:
             return numbers.float() / 255.0
         if name in self.scales:

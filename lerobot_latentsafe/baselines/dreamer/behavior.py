@@ -132,15 +132,16 @@ class Actor(nn.Module):
     def distribution(self, features: Tensor) -> torch.distributions.Normal:
         mean, std = self.net(features).chunk(2, -1)
         std = self.min_std + (self.max_std - self.min_std) * torch.sigmoid(std - 2)
-        return torch.distributions.Normal(torch.tanh(mean), std)
+        return torch.distributions.Normal(torch.tanh(mean), std, validate_args=False)  # checks wait for the GPU
 
     def mode(self, features: Tensor) -> Tensor:
         """Features (..., D) -> actions (..., A)."""
         return self.distribution(features).mean * self.varies
 
     def sample(self, features: Tensor) -> Tensor:
-        """Features (..., D) -> actions (..., A), clipped into [-1, 1]."""
-        return (self.distribution(features).sample() * self.varies).clamp(-1, 1)
+        """Features (..., D) -> actions (..., A), to be clipped into [-1, 1] by whoever executes them."""
+        spread = self.distribution(features)
+        return (spread.mean + spread.stddev * torch.randn_like(spread.mean)) * self.varies
 
     def log_prob(self, features: Tensor, action: Tensor) -> Tensor:
         """Log density of actions (..., A): (...,)."""
@@ -152,11 +153,11 @@ class Actor(nn.Module):
 
 @torch.no_grad()
 def imagine(world_model: WorldModel, actor: Actor, start: Latent, horizon: int) -> tuple[Tensor, Tensor]:
-    """Follow the actor from N latents: features (H + 1, N, D) and actions (H, N, A)."""
+    """Follow the actor from N latents: features (H + 1, N, D) and actions (H, N, A) before clipping."""
     latent, features, actions = start, [world_model.features(start)], []
     for _ in range(horizon):
         actions.append(actor.sample(features[-1]))
-        latent = world_model.sample_step(latent, actions[-1])
+        latent = world_model.sample_step(latent, actions[-1].clamp(-1, 1))
         features.append(world_model.features(latent))
     return torch.stack(features), torch.stack(actions)
 
@@ -189,6 +190,7 @@ class ReturnRange(nn.Module):
     @torch.no_grad()
     def update(self, returns: Tensor) -> Tensor:
         """Returns of any shape -> the divisor ()."""
-        low, high = torch.quantile(returns.flatten(), returns.new_tensor([0.05, 0.95]))
+        ordered = returns.flatten().sort().values
+        low, high = (ordered[round(share * (len(ordered) - 1))] for share in (0.05, 0.95))
         self.range.lerp_(high - low, self.rate)
         return self.range.clamp(min=1)

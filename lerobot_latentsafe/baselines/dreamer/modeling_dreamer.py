@@ -81,7 +81,7 @@ class LatentSafeDreamerPolicy(PreTrainedPolicy):
         first = self.latent is None
         self.latent = model.world_model.observe(self.latent, self.executed, percepts, state)
         features = model.world_model.features(self.latent)
-        self.executed = self.actor.sample(features) if explore else self.actor.mode(features)
+        self.executed = self.actor.sample(features).clamp(-1, 1) if explore else self.actor.mode(features)
         if first:  # what counts as having led to the first frame depends on its action, see `first_action`
             self.latent = model.world_model.observe(None, model.first_action(self.executed), percepts, state)
         return model.denormalise_action(self.executed)
@@ -104,15 +104,15 @@ class LatentSafeDreamerPolicy(PreTrainedPolicy):
             "a latentsafe_dreamer policy learns from episodes of its own: train it with latentsafe train-dreamer"
         )
 
-    def model_loss(self, clip: Clip, reward: Tensor) -> tuple[Tensor, Tensor, dict[str, float]]:
+    def model_loss(self, clip: Clip, reward: Tensor) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
         """Loss of world model, margin and reward head, the clip's features (B, T, D), and metrics.
 
         Args:
             reward: (B, T), that of arriving at each frame.
         """
         loss, features, metrics = self.model.clip_loss(clip)
-        reward_loss = self.reward.loss(features, reward)[clip.valid].mean()
-        return loss + reward_loss, features, {**metrics, "loss_reward": reward_loss.item()}
+        reward_loss = (self.reward.loss(features, reward) * clip.valid).sum() / clip.valid.sum()
+        return loss + reward_loss, features, {**metrics, "loss_reward": reward_loss}
 
     def cloning_loss(self, features: Tensor, action: Tensor, valid: Tensor) -> Tensor:
         """Negative log density of the actions that were taken after each frame: ().
@@ -123,7 +123,7 @@ class LatentSafeDreamerPolicy(PreTrainedPolicy):
         known, surprise = valid[:, 1:], -self.actor.log_prob(features[:, :-1], action[:, 1:])
         return (surprise * known).sum() / known.sum().clamp(min=1)
 
-    def behavior_losses(self, start: Latent) -> tuple[Tensor, Tensor, dict[str, float]]:
+    def behavior_losses(self, start: Latent) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
         """Losses of actor (by the policy gradient) and critic on imagined rollouts from N latents, and metrics."""
         config, world_model = self.config.behavior, self.model.world_model
         features, actions = imagine(world_model, self.actor, start, config.horizon)
@@ -136,16 +136,16 @@ class LatentSafeDreamerPolicy(PreTrainedPolicy):
         actor_loss = -(advantage * self.actor.log_prob(before, actions)).mean() - config.entropy * entropy
         critic_loss = self.critic.loss(before, returns).mean()
         metrics = {
-            "loss_actor": actor_loss.item(), "loss_critic": critic_loss.item(), "entropy": entropy.item(),
-            "imagined_reward": reward.mean().item(), "imagined_return": returns.mean().item(),
+            "loss_actor": actor_loss, "loss_critic": critic_loss, "entropy": entropy,
+            "imagined_reward": reward.mean(), "imagined_return": returns.mean(),
         }  # fmt: skip
         return actor_loss, critic_loss, metrics
 
     @torch.no_grad()
     def follow_slowly(self) -> None:
         """Move the slow critic towards the critic."""
-        for slow, fast in zip(self.slow_critic.parameters(), self.critic.parameters()):
-            slow.lerp_(fast, self.config.behavior.slow_rate)
+        slow, fast = list(self.slow_critic.parameters()), list(self.critic.parameters())
+        torch._foreach_lerp_(slow, fast, self.config.behavior.slow_rate)
 
     # -- files ---
 
@@ -189,9 +189,9 @@ def _load_world_model(config: LatentSafeDreamerConfig) -> LatentSafePolicy:
             "this latentsafe_dreamer policy has no world model: train one with latentsafe train-dreamer, or load one "
             "with --policy.path=..."
         )
-    model = LatentSafePolicy.from_pretrained(config.world_model_path)
-    model.config.device = config.device
-    return model.to(config.device)
+    model_config = read_config(resolve_checkpoint(config.world_model_path))
+    model_config.device = config.device
+    return LatentSafePolicy.from_pretrained(config.world_model_path, config=model_config)
 
 
 def adopt_world_model(config: LatentSafeDreamerConfig, model: LatentSafePolicy) -> None:

@@ -69,16 +69,18 @@ class Replay:
 
     Attributes:
         arrays: name -> (n_episodes x length, ...); percepts by camera, state, action, failure, terms.
+        percepts: camera -> the same pictures on the device of training.
         written: bool (n_episodes,).
         length: frames of an episode.
     """
 
     arrays: dict[str, np.ndarray]
+    percepts: dict[str, torch.Tensor]
     written: np.ndarray
     length: int
 
     @classmethod
-    def open(cls, folder: Path, n_episodes: int, length: int, image_size: int) -> "Replay":
+    def open(cls, folder: Path, n_episodes: int, length: int, image_size: int, device: str = "cpu") -> "Replay":
         """Open, or make, a replay for so many episodes.
 
         Raises:
@@ -105,7 +107,8 @@ class Replay:
                     f"{file} has shape {arrays[name].shape}, expected {shape}: it is of a run with other sizes; choose "
                     "another --output_dir or delete it"
                 )
-        return cls(arrays, arrays.pop("written"), length)
+        percepts = {key: torch.from_numpy(arrays[key]).to(device) for key in CAMERA_KEYS}
+        return cls(arrays, percepts, arrays.pop("written"), length)
 
     def write(self, i: int, episode: dict[str, np.ndarray]) -> None:
         """Store episode i."""
@@ -113,6 +116,8 @@ class Replay:
         for name, values in episode.items():
             self.arrays[name][frames] = values
             self.arrays[name].flush()
+        for key, pictures in self.percepts.items():
+            pictures[frames] = torch.from_numpy(episode[key]).to(pictures.device)
         self.written[i] = True
         self.written.flush()
 
@@ -122,8 +127,7 @@ class Replay:
         labels = FailureLabels(
             self.arrays["failure"][:n], np.zeros(n, np.int8), np.repeat(np.arange(n_episodes), self.length)
         )
-        percepts = {key: self.arrays[key] for key in CAMERA_KEYS}
-        cache = FrameCache(percepts, {}, self.arrays["state"], self.arrays["action"], {})
+        cache = FrameCache(self.percepts, {}, self.arrays["state"], self.arrays["action"], {})
         return ClipReader(labels, cache, clip_length)
 
     def statistics(self, n_episodes: int) -> dict[str, dict[str, np.ndarray]]:

@@ -7,7 +7,7 @@ so a run that was killed goes on from its last checkpoint as if nothing had happ
 import json
 import shutil
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import draccus
@@ -19,15 +19,14 @@ from lerobot.optim.optimizers import load_optimizer_state, save_optimizer_state
 from torch import Tensor
 
 from lerobot_latentsafe.baselines.dreamer.configuration_dreamer import LatentSafeDreamerConfig
+from lerobot_latentsafe.baselines.dreamer.cuda_graph import Replayed
 from lerobot_latentsafe.baselines.dreamer.modeling_dreamer import LatentSafeDreamerPolicy
-from lerobot_latentsafe.baselines.dreamer.replay import CAMERA_KEYS, Operator, Replay, described, export, record
+from lerobot_latentsafe.baselines.dreamer.recorders import Recorders, number
+from lerobot_latentsafe.baselines.dreamer.replay import CAMERA_KEYS, Replay, described, export
 from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
-from lerobot_latentsafe.datasets.collect_franka import SOURCES
-from lerobot_latentsafe.envs.franka_env import BlocksEnv
 from lerobot_latentsafe.memory import keep_freed_memory
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, adopt_dataset
 from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, STATE_NAMES
-from lerobot_latentsafe.teleoperators.scripted.behaviors import Actions, begin
 from lerobot_latentsafe.training import save_filter
 from lerobot_latentsafe.world_models.base import Clip
 
@@ -59,7 +58,11 @@ class TrainDreamer:
     collect_every: int = 100
     """Steps between rounds of episodes."""
     n_envs: int = 8
-    """Episodes of a round."""
+    """Episodes of a round; they join the batches when the next one begins."""
+    workers: int = 0
+    """Processes that record episodes while this one trains; 0: it does so itself."""
+    cuda_graph: bool = True
+    """On a GPU, replay a step as one graph; what is learned is the same."""
     batch_size: int = 20
     """Clips of a step."""
     demonstration_share: float = 0.1
@@ -94,16 +97,19 @@ class DreamerTraining:
     def __init__(self, options: TrainDreamer):
         self.options, self.folder = options, Path(options.output_dir)
         self._claim()
-        self.envs = [BlocksEnv() for _ in range(options.n_envs)]
-        self.scene = self.envs[0].scene
         self.image_size = options.model.world_model.image_size
+        self.recorders = Recorders(options.seed, self.image_size, options.workers)
+        self.scene, length = self.recorders.env.scene, self.recorders.env._max_episode_steps
         n_episodes = options.demonstrations + options.n_rounds * options.n_envs
-        self.replay = Replay.open(self.folder / "replay", n_episodes, self.envs[0]._max_episode_steps, self.image_size)
-        self.started = time.process_time()
+        device = options.model.device
+        self.replay = Replay.open(self.folder / "replay", n_episodes, length, self.image_size, device)
+        self.started, self.coming = time.process_time(), []
         self._record_demonstrations()
         self._load() if self._checkpoints() else self._begin()
-        if self.policy.model.device.type == "cpu":
+        if device == "cpu":
             keep_freed_memory()
+        else:
+            torch.set_float32_matmul_precision("high")
 
     def run(self) -> LatentSafeDreamerPolicy:
         """Train to the end, and write the policy and its episodes."""
@@ -111,11 +117,11 @@ class DreamerTraining:
         while self.step < options.steps:
             since = self.step - options.pretraining
             if since >= 0 and since % options.collect_every == 0:
-                self._record_round(since // options.collect_every)
+                self._begin_round(since // options.collect_every)
             metrics = self.update()
             self.step += 1
             if self.step % options.log_every == 0:
-                self._note(metrics)
+                self._note({name: float(value) for name, value in metrics.items()})
             if self.step % options.save_every == 0 or self.step == options.steps:
                 self._save()
         self.policy.eval()
@@ -123,76 +129,76 @@ class DreamerTraining:
             save_filter(self.policy, self.folder / "policy.unfinished")
             (self.folder / "policy.unfinished").rename(self.folder / "policy")
         if not (self.folder / "episodes").exists():
-            export(self.replay, self.n_episodes, self.folder / "episodes", options.repo_id, self.scene)
-        self._note({"simulator_steps": self.n_episodes * self.replay.length})
-        for env in self.envs:
-            env.close()
+            export(self.replay, len(self.replay.written), self.folder / "episodes", options.repo_id, self.scene)
+        self._note({"simulator_steps": len(self.replay.written) * self.replay.length})
+        self.recorders.close()
         return self.policy
 
     # -- episodes ---
 
     @property
     def n_episodes(self) -> int:
-        """Episodes that there are at this step: demonstrations first, then rounds of the policy's."""
+        """Episodes that batches are drawn from at this step: demonstrations, then rounds of the policy's."""
         options = self.options
-        rounds = (self.step - options.pretraining) // options.collect_every + 1
+        rounds = (self.step - options.pretraining) // options.collect_every
         return options.demonstrations + min(max(rounds, 0), options.n_rounds) * options.n_envs
 
     def _record_demonstrations(self) -> None:
         """By the scripted operators; episodes that are there already stay."""
-        source, n_envs = SOURCES["blocks_demos"], len(self.envs)
-        for first in range(0, self.options.demonstrations, n_envs):
-            episodes = list(range(first, min(first + n_envs, self.options.demonstrations)))
-            if not self.replay.written[episodes].all():
-                operators = [
-                    begin(source.behavior(i), env.scene, None, np.random.default_rng([self.options.seed, i]))
-                    for env, i in zip(self.envs, episodes)
-                ]
-                self._record(episodes, _Scripted(operators))
+        missing = np.flatnonzero(~self.replay.written[: self.options.demonstrations]).tolist()
+        for i, episode in zip(missing, self.recorders(missing, None)):
+            self.replay.write(i, episode)
 
-    @torch.no_grad()
-    def _record_round(self, index: int) -> None:
-        """By the policy as it is, exploring."""
-        options, policy = self.options, self.policy.eval()
-        episodes = [options.demonstrations + index * options.n_envs + i for i in range(options.n_envs)]
-        torch.manual_seed(_number(options.seed, 1, index))
-        policy.reset()
-        outcomes = self._record(episodes, lambda batch: policy.act(batch, explore=True).cpu().numpy())
-        self._note({"round": index, **{name: int(sum(o[name] for o in outcomes)) for name in ("success", "violation")}})
+    def _begin_round(self, index: int) -> None:
+        """Of the policy as it is, exploring; the round before is finished first."""
+        self._finish_round()
+        options, folder = self.options, self.folder / "acting"
+        shutil.rmtree(folder, ignore_errors=True)
+        self.policy.save_pretrained(folder / str(index))
+        first = options.demonstrations + index * options.n_envs
+        episodes = list(range(first, first + options.n_envs))
+        self.coming = zip(episodes, self.recorders(episodes, folder / str(index)))
 
-    def _record(self, episodes: list[int], operator: Operator) -> list[dict[str, bool]]:
-        seeds = [1_000_000 * self.options.seed + i for i in episodes]
-        recorded = record(self.envs[: len(episodes)], seeds, operator, self.image_size)
+    def _finish_round(self) -> None:
         outcomes = []
-        for i, episode in zip(episodes, recorded):
+        for i, episode in self.coming:
             self.replay.write(i, episode)
             violation = bool(episode["failure"].any())
             outcomes.append({"success": bool(episode["terms"][-1, 1]) and not violation, "violation": violation})
-        return outcomes
+        self.coming = []
+        if outcomes:
+            counts = {name: sum(o[name] for o in outcomes) for name in outcomes[0]}
+            self._note({"episodes": i + 1, **counts})
 
     # -- learning ---
 
-    def update(self) -> dict[str, float]:
+    def update(self) -> dict[str, Tensor]:
         """One step on world model, margin, rewards, actor and critic."""
-        torch.manual_seed(_number(self.options.seed, 2, self.step))
-        policy, config = self.policy.train(), self.policy.config.behavior
-        clip, reward, demonstrated = self._batch()
-        loss, features, metrics = policy.model_loss(clip, reward)
-        self._descend("model", loss)
-        features = features.detach()
-        cloning_loss = policy.cloning_loss(*(part[demonstrated] for part in (features, clip.action, clip.valid)))
-        kept = clip.valid.flatten().nonzero().squeeze(1)
-        kept = kept[torch.randperm(len(kept))[: config.starts].to(kept.device)]
-        start = policy.model.world_model.latent_of(features.flatten(0, 1)[kept], clip.action.flatten(0, 1)[kept])
-        actor_loss, critic_loss, imagined = policy.behavior_losses(start)
-        # At first the critic only learns what imitation is worth.
-        learning = self.step >= self.options.pretraining
-        behavior_loss = critic_loss + (actor_loss + config.cloning * cloning_loss if learning else cloning_loss)
-        self._descend("behavior", behavior_loss)
-        policy.follow_slowly()
-        return {"loss": loss.item(), "loss_cloning": cloning_loss.item(), **metrics, **imagined}
+        torch.manual_seed(number(self.options.seed, 2, self.step))
+        metrics = self.backpropagate(*self._batch())
+        for name in self.optimizers:
+            self._descend(name)
+        self.policy.follow_slowly()
+        return metrics
 
-    def _descend(self, name: str, loss: Tensor) -> None:
+    def _backpropagate(
+        self, reward: Tensor, demonstrated: Tensor, starts: Tensor, weights: Tensor, front: Tensor, wrist: Tensor,
+        *rest: Tensor,
+    ) -> dict[str, Tensor]:  # fmt: skip
+        """Gradients of all losses, and metrics; for `Replayed`. The arguments are those of `_batch`."""
+        for optimizer in self.optimizers.values():
+            optimizer.zero_grad(set_to_none=True)
+        policy, clip = self.policy, Clip(dict(zip(CAMERA_KEYS, (front, wrist))), *rest)
+        loss, features, metrics = policy.model_loss(clip, reward)
+        features = features.detach()
+        cloning_loss = policy.cloning_loss(features, clip.action, clip.valid & demonstrated[:, None])
+        start = policy.model.world_model.latent_of(features.flatten(0, 1)[starts], clip.action.flatten(0, 1)[starts])
+        actor_loss, critic_loss, imagined = policy.behavior_losses(start)
+        (loss + critic_loss + weights[0] * actor_loss + weights[1] * cloning_loss).backward()
+        metrics = {"loss": loss, "loss_cloning": cloning_loss, **metrics, **imagined}
+        return {name: value.detach() for name, value in metrics.items()}
+
+    def _descend(self, name: str) -> None:
         """A gradient step; step sizes rise over the first 100 steps and fall over the second half."""
         options, optimizer = self.options, self.optimizers[name]
         decay = min(1.0, (self.step + 1) / 100, 2.05 - 2 * self.step / options.steps)
@@ -200,14 +206,18 @@ class DreamerTraining:
         for group, lr in zip(optimizer.param_groups, self.step_sizes[name]):
             group["lr"] = lr * decay
             parameters += group["params"]
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()
         torch.nn.utils.clip_grad_norm_(parameters, self.policy.model.config.grad_clip_norm)
         optimizer.step()
 
-    def _batch(self) -> tuple[Clip, Tensor, Tensor]:
-        """A clip of windows, their rewards (B, T), and which rows are demonstrations: bool (B,)."""
+    def _batch(self) -> tuple[Tensor, ...]:
+        """What a step learns from.
+
+        Returns:
+            Rewards of a clip's windows (B, T); which rows are demonstrations, bool (B,); the frames of the flat clip
+            from which imagination starts (N,); weights of actor and cloning (2,); and what a `Clip` is made of.
+        """
         options, policy = self.options, self.policy
+        config, device = policy.config.behavior, policy.model.device
         rng = np.random.default_rng([options.seed, self.step])
         reader = self.replay.reader(self.n_episodes, policy.model.config.world_model.clip_length)
         n_frames, n_demonstrated = len(reader.labels.failure), options.demonstrations * self.replay.length
@@ -215,22 +225,33 @@ class DreamerTraining:
         if n_frames > n_demonstrated:
             n = max(1, round(options.demonstration_share * options.batch_size))
         demonstrated = np.arange(options.batch_size) < n
-        start = np.where(
+        first = np.where(
             demonstrated,
             rng.integers(n_demonstrated, size=options.batch_size),
             rng.integers(min(n_demonstrated, n_frames - 1), n_frames, size=options.batch_size),
         )
-        clip = reader.cut(start, policy.model)
-        window = np.minimum(start[:, None] + np.arange(reader.length), n_frames - 1)
-        terms = torch.from_numpy(self.replay.arrays["terms"][window]).to(policy.model.device)
-        return clip, policy.config.behavior.rewards.reward(terms), torch.from_numpy(demonstrated)
+        clip = reader.cut(first, policy.model)
+        ahead = first[:, None] + np.arange(reader.length)
+        window = np.minimum(ahead, n_frames - 1)
+        reward = config.rewards.reward(torch.from_numpy(self.replay.arrays["terms"][window]))
+        same = reader.labels.episode[window] == reader.labels.episode[first][:, None]
+        valid = np.flatnonzero(same & (ahead == window))
+        # At first the critic only learns what imitation is worth.
+        weights = [1.0, config.cloning] if self.step >= options.pretraining else [0.0, 1.0]
+        drawn = (reward, torch.from_numpy(demonstrated), torch.from_numpy(rng.choice(valid, config.starts)))
+        percepts, *rest = (getattr(clip, field.name) for field in fields(Clip))
+        return (
+            *(t.to(device) for t in (*drawn, torch.tensor(weights))),
+            *(percepts[key] for key in CAMERA_KEYS),
+            *rest,
+        )
 
     # -- files ---
 
     def _begin(self) -> None:
         """Fresh weights, for what the demonstrations hold."""
         options = self.options
-        torch.manual_seed(_number(options.seed, 0, 0))
+        torch.manual_seed(number(options.seed, 0, 0))
         config = options.model
         config.cameras, config.task = list(CAMERA_KEYS), self.scene.task
         shape = (3, self.scene.image_size, self.scene.image_size)
@@ -243,7 +264,11 @@ class DreamerTraining:
         self._train(LatentSafeDreamerPolicy(options.policy, LatentSafePolicy(config)), 0)
 
     def _train(self, policy: LatentSafeDreamerPolicy, step: int) -> None:
-        self.policy, self.step = policy, step
+        self.policy, self.step = policy.train(), step
+        self.backpropagate = self._backpropagate
+        if self.options.cuda_graph and policy.model.device.type == "cuda":
+            changed = [*policy.buffers(), *policy.model.buffers()]
+            self.backpropagate = Replayed(self._backpropagate, changed)
         config = policy.config.behavior
         parts = {
             "model": [([*policy.model.get_optim_params(), *policy.reward.parameters()], config.model_lr)],
@@ -259,7 +284,8 @@ class DreamerTraining:
         return sorted(p for p in (self.folder / "checkpoints").glob("*") if p.name.isdigit())
 
     def _save(self) -> None:
-        """Write a checkpoint whole, then drop the one before."""
+        """Write a checkpoint whole, then drop the one before; a round that is being recorded is kept, too."""
+        self._finish_round()
         before = self._checkpoints()
         partial = self.folder / "checkpoints" / "unfinished"
         shutil.rmtree(partial, ignore_errors=True)
@@ -281,7 +307,7 @@ class DreamerTraining:
             ValueError: the folder holds a run with other options.
         """
         wanted = json.loads(json.dumps(draccus.encode(self.options)))
-        for name in ("output_dir", "log_every"):
+        for name in ("output_dir", "log_every", "workers", "cuda_graph"):
             del wanted[name]
         note = self.folder / OPTIONS
         if note.exists() and (known := json.loads(note.read_text())) != wanted:
@@ -298,20 +324,3 @@ class DreamerTraining:
         with (self.folder / LOG).open("a") as file:
             file.write(json.dumps(row) + "\n")
         print(" ".join(f"{k} {v:.3g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()), flush=True)
-
-
-class _Scripted:
-    """Operators of `teleoperators/scripted`, one an environment; when they have finished they hold still."""
-
-    def __init__(self, operators: list[Actions]):
-        self.operators, self.last = operators, np.zeros((len(operators), len(ACTION_NAMES)))
-
-    def __call__(self, batch: dict[str, Tensor]) -> np.ndarray:
-        still = [np.append(np.zeros(6), last[6]) for last in self.last]
-        self.last = np.stack([next(operator, stay) for operator, stay in zip(self.operators, still)])
-        return self.last
-
-
-def _number(*parts: int) -> int:
-    """A seed that depends on all parts."""
-    return int(np.random.SeedSequence(parts).generate_state(1)[0])

@@ -1,0 +1,105 @@
+"""Recording episodes in this process, or in others while this one trains: the same episodes wherever it is done."""
+
+from collections.abc import Iterator
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lerobot_latentsafe.baselines.dreamer.modeling_dreamer import LatentSafeDreamerPolicy
+from lerobot_latentsafe.baselines.dreamer.replay import record
+from lerobot_latentsafe.checkpoint import read_config
+from lerobot_latentsafe.datasets.collect_franka import SOURCES
+from lerobot_latentsafe.envs.franka_env import BlocksEnv
+from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES
+from lerobot_latentsafe.teleoperators.scripted.behaviors import Actions, begin
+
+Job = tuple[int, Path | None]
+"""An episode's number, and the folder of the policy that acts in it; None: a scripted operator does."""
+
+
+class Recorder:
+    """Records one episode after the other.
+
+    Args:
+        seed: of all of them.
+        image_size: side of the pictures that are kept.
+    """
+
+    def __init__(self, seed: int, image_size: int):
+        self.seed, self.image_size = seed, image_size
+        self.env, self.source = BlocksEnv(), SOURCES["blocks_demos"]
+        self.folder: Path | None = None
+
+    def __call__(self, job: Job) -> dict[str, np.ndarray]:
+        """Arrays of the episode, see `record`."""
+        episode, folder = job
+        if folder is None:
+            rng = np.random.default_rng([self.seed, episode])
+            operator = _Scripted(begin(self.source.behavior(episode), self.env.scene, None, rng))
+        else:
+            operator = self._exploring(folder)
+            torch.manual_seed(number(self.seed, 1, episode))
+        return record([self.env], [1_000_000 * self.seed + episode], operator, self.image_size)[0]
+
+    def _exploring(self, folder: Path):
+        if folder != self.folder:
+            config = read_config(folder)
+            config.device = "cpu"
+            self.policy, self.folder = LatentSafeDreamerPolicy.from_pretrained(folder, config=config).eval(), folder
+        self.policy.reset()
+        return lambda batch: self.policy.act(batch, explore=True).numpy()
+
+
+class Recorders:
+    """A `Recorder` here, or one in each of `workers` processes.
+
+    Attributes:
+        env: an environment like those of the episodes.
+    """
+
+    def __init__(self, seed: int, image_size: int, workers: int):
+        self.here, self.pool = Recorder(seed, image_size), None
+        self.env = self.here.env
+        if workers:
+            self.pool = get_context("spawn").Pool(workers, _start, (seed, image_size))
+
+    def __call__(self, episodes: list[int], folder: Path | None) -> Iterator[dict[str, np.ndarray]]:
+        """Begin to record; episodes come in their order, as soon as there are."""
+        jobs: list[Job] = [(episode, folder) for episode in episodes]
+        return self.pool.imap(_record, jobs) if self.pool else map(self.here, jobs)
+
+    def close(self) -> None:
+        """End the processes."""
+        self.env.close()
+        if self.pool:
+            self.pool.terminate()
+            self.pool.join()
+
+
+class _Scripted:
+    """An operator of `teleoperators/scripted`; when it has finished it holds still."""
+
+    def __init__(self, operator: Actions):
+        self.operator, self.last = operator, np.zeros(len(ACTION_NAMES))
+
+    def __call__(self, batch: dict[str, Tensor]) -> np.ndarray:
+        self.last = next(self.operator, np.append(np.zeros(6), self.last[6]))
+        return self.last[None]
+
+
+def _start(seed: int, image_size: int) -> None:
+    global _recorder
+    torch.set_num_threads(1)
+    _recorder = Recorder(seed, image_size)
+
+
+def _record(job: Job) -> dict[str, np.ndarray]:
+    return _recorder(job)
+
+
+def number(*parts: int) -> int:
+    """A seed that depends on all parts."""
+    return int(np.random.SeedSequence(parts).generate_state(1)[0])
