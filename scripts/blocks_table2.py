@@ -1,36 +1,23 @@
 #!/usr/bin/env python
 """Table 2: the blocks' task policy bare, under SQRL, under the latent safety filter, and under the simulator itself.
 
-    scripts/blocks_table2.py --dreamer outputs/blocks/dreamer/policy \
+    scripts/blocks_table2.py --dreamer outputs/blocks/dreamer/policy --workers=2 \
         --filters outputs/blocks/filter/seed_{0,1,2} --risks outputs/blocks/risk/seed_{0,1,2}
 
 All methods start from the same states. Writes table2.json, trade_off.png, unsafe_rollout.png and lead.png to
---output_dir. Each row of rollouts is kept in --cells, so that a killed run goes on where it stopped.
+--output_dir. Each episode is kept in --cells as it ends, so that a killed run goes on where it stopped.
 """
 
 import argparse
-import hashlib
-import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import torch
 
-from lerobot_latentsafe.envs.configuration_envs import LatentSafeBlocksEnv
-from lerobot_latentsafe.evaluation.blocks_study import (
-    lead,
-    leads,
-    lookahead_episodes,
-    trade_off,
-    unsafe_rollout,
-    values_along,
-)
+from lerobot_latentsafe.envs.scenes import SCENES
+from lerobot_latentsafe.evaluation.bag import fingerprint
+from lerobot_latentsafe.evaluation.blocks_study import lead, leads, run, run_filmed, trade_off, unsafe_rollout
 from lerobot_latentsafe.evaluation.figures import save
-from lerobot_latentsafe.evaluation.rollouts import paired_p_value, provenance, wilson, write_json
-from lerobot_latentsafe.evaluation.shielding import Episodes, check_environment, run_episodes
-from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
-from lerobot_latentsafe.shield import BasePolicy
+from lerobot_latentsafe.evaluation.rollouts import paired_p_value, provenance, run_resumable, wilson, write_json
 
 FIRST_SEED = 400_000
 """Of the table's starts; training and choices use smaller ones."""
@@ -42,72 +29,39 @@ EPSILONS = (-0.4, 0.0, 0.2, 0.4, 0.6, 0.8)
 RISK_CURVE = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
 OUTCOMES = ("success", "violation", "incompletion")
 
-
-class Study:
-    """Rollouts of one task policy, each kind of them run once and remembered in a file."""
-
-    def __init__(self, dreamer: str, cells: Path):
-        self.dreamer, self.cells, self.env = dreamer, cells, LatentSafeBlocksEnv()
-
-    def bare(self, n: int, seed: int) -> dict:
-        return self._cell("dreamer", n, seed, lambda: run_episodes(BasePolicy(self.dreamer, "cpu"), self.env, n, seed))
-
-    def lookahead(self, n: int, seed: int) -> dict:
-        return self._cell("lookahead", n, seed, lambda: lookahead_episodes(BasePolicy(self.dreamer, "cpu"), n, seed))
-
-    def shielded(self, path: str, epsilon: float, n: int, seed: int) -> dict:
-        """Under the filter at a path; of a risk critic, epsilon is -eps_risk."""
-        run = lambda: run_episodes(self.filter(path, epsilon), self.env, n, seed)  # noqa: E731
-        return self._cell(f"{Path(path).resolve()} {epsilon:g}", n, seed, run)
-
-    def filter(self, path: str, epsilon: float, mode: str = "filter") -> LatentSafePolicy:
-        policy = LatentSafePolicy.from_pretrained(path)
-        policy.config.epsilon, policy.config.mode = epsilon, mode
-        policy.attach(self.dreamer)
-        check_environment(policy, self.env)
-        return policy
-
-    def _cell(self, name: str, n: int, seed: int, run: Callable[[], Episodes]) -> dict:
-        key = hashlib.sha256(f"{Path(self.dreamer).resolve()} {name} {n} {seed}".encode()).hexdigest()[:16]
-        file = self.cells / f"{key}.json"
-        if not file.exists():
-            episodes = run()
-            outcome = {k: getattr(episodes, k).tolist() for k in ("success", "violation")}
-            outcome["overridden_share"] = float(episodes.overridden.sum() / episodes.steps.sum())
-            write_json(file, {"name": name, "n": n, "seed": seed, **outcome})
-            print(name, f"success {sum(outcome['success'])}/{n} violation {sum(outcome['violation'])}/{n}", flush=True)
-        row = json.loads(file.read_text())
-        success, violation = (np.array(row[k], bool) for k in ("success", "violation"))
-        return {**row, "success": success, "violation": violation, "incompletion": ~success & ~violation}
+Rows = list[dict]
+"""Of `run`, of one method from all starts."""
 
 
-def rates(rows: list[dict]) -> dict:
-    """Outcomes of all rows together as {k, n, low, high}, and of each."""
-    shares = lambda some: {  # noqa: E731
-        name: wilson(sum(row[name].sum() for row in some), sum(len(row[name]) for row in some)) for name in OUTCOMES
-    }
-    overridden = float(np.mean([row["overridden_share"] for row in rows]))
-    return {**shares(rows), "overridden_share": overridden, "per_seed": [shares([row]) for row in rows]}
+def happened(rows: Rows, outcome: str) -> np.ndarray:
+    """bool (n,)."""
+    success, violation = (np.array([row[name] for row in rows], bool) for name in ("success", "violation"))
+    return {"success": success, "violation": violation, "incompletion": ~success & ~violation}[outcome]
 
 
-def against(rows: list[dict], bare: dict) -> list[dict]:
-    """Exact McNemar tests of each seed's row against the bare policy, start by start."""
-    return [{name: paired_p_value(bare[name], row[name]) for name in OUTCOMES} for row in rows]
+def rates(cells: list[Rows]) -> dict:
+    """Outcomes of all seeds together as {k, n, low, high}, and of each."""
+    share = lambda rows: {name: wilson(happened(rows, name).sum(), len(rows)) for name in OUTCOMES}  # noqa: E731
+    every = [row for rows in cells for row in rows]
+    overridden = sum(row["overridden"] for row in every) / sum(row["steps"] for row in every)
+    return {**share(every), "overridden_share": overridden, "per_seed": [share(rows) for rows in cells]}
 
 
-def lead_times(study: Study, path: str, n: int, seed: int) -> tuple[list[int], int, tuple]:
-    """Leads of all failing rollouts, how many failures l missed, and (frames, l, V) of the first one that was led."""
-    policy = study.filter(path, EPSILON, mode="monitor")
+def against(cells: list[Rows], bare: Rows) -> list[dict]:
+    """Exact McNemar tests of each seed's rows against the bare policy's, start by start."""
+    return [{name: paired_p_value(happened(bare, name), happened(rows, name)) for name in OUTCOMES} for rows in cells]
+
+
+def lead_times(rows: Rows) -> tuple[list[int], int, int | None]:
+    """Leads of all failing rollouts, how many failures l missed, and which was the first one that was led."""
     found, missed, shown = [], 0, None
-    for first in range(0, n, 25):  # few at a time: every frame is kept
-        episodes = run_episodes(policy, study.env, min(25, n - first), seed + first, n_videos=25)
-        for i in np.flatnonzero(episodes.violation):
-            margin, value = values_along(policy, episodes.latents[i])
-            steps = lead(margin, value, EPSILON)
+    for i, row in enumerate(rows):
+        if row["violation"]:
+            steps = lead(np.array(row["margin"]), np.array(row["value"]), EPSILON)
             missed += steps is None
             if steps is not None:
                 found.append(steps)
-                shown = shown or ((episodes.frames[i], margin, value) if steps > 0 else None)
+                shown = i if shown is None and steps > 0 else shown
     return found, missed, shown
 
 
@@ -118,39 +72,62 @@ def main() -> None:
     parser.add_argument("--risks", nargs="+", required=True, help="filters with a risk critic, one a seed")
     parser.add_argument("--n", type=int, default=200, help="starts")
     parser.add_argument("--n_curve", type=int, default=100, help="starts of each point of the curve, first seeds only")
-    parser.add_argument("--cells", type=Path, default=Path("outputs/blocks/cells"))
+    parser.add_argument("--workers", type=int, default=1, help="processes")
+    parser.add_argument("--cells", type=Path, default=Path("outputs/blocks/cells.jsonl"))
     parser.add_argument("--output_dir", type=Path, default=Path("results/blocks"))
     arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    study, n = Study(arguments.dreamer, arguments.cells), arguments.n
+    dreamer, filters, risks = arguments.dreamer, arguments.filters, arguments.risks
 
-    bare = study.bare(n, FIRST_SEED)
-    rows = {
-        "dreamer": [bare],
-        **{f"sqrl_{risk:g}": [study.shielded(p, -risk, n, FIRST_SEED) for p in arguments.risks] for risk in RISKS},
-        "latentsafe": [study.shielded(p, EPSILON, n, FIRST_SEED) for p in arguments.filters],
-        "lookahead": [study.lookahead(n, FIRST_SEED)],
+    def jobs(n: int, first: int, mode: str, path: str | None = None, epsilon: float | None = None) -> list[dict]:
+        made_of = [fingerprint(p) for p in (dreamer, f"{dreamer}/world_model", path) if p]
+        job = {"dreamer": dreamer, "filter": path, "mode": mode, "epsilon": epsilon, "made_of": made_of}
+        return [{**job, "seed": seed} for seed in range(first, first + n)]
+
+    table = lambda *cell: jobs(arguments.n, FIRST_SEED, *cell)  # noqa: E731
+    curve = lambda *cell: jobs(arguments.n_curve, CURVE_SEED, *cell)  # noqa: E731
+    cells = {
+        "dreamer": table("bare"),
+        **{("latentsafe", path): table("filter", path, EPSILON) for path in filters},
+        **{(f"sqrl_{r:g}", path): table("filter", path, -r) for r in RISKS for path in risks},
+        "lookahead": table("lookahead"),
+        "watched": table("monitor", filters[0], EPSILON),
+        **{("epsilon", e): curve("filter", filters[0], e) for e in EPSILONS},
+        **{("risk", r): curve("filter", risks[0], -r) for r in RISK_CURVE},
+        "no filter": curve("bare"),
     }
-    methods = {name: {**rates(r), "mcnemar_against_dreamer": against(r, bare)} for name, r in rows.items()}
+    rows = iter(
+        run_resumable(arguments.cells, [job for cell in cells.values() for job in cell], run, arguments.workers)
+    )
+    ran = {name: [next(rows) for _ in cell] for name, cell in cells.items()}
 
-    n_curve = arguments.n_curve
-    at = lambda path, epsilon: rates([study.shielded(path, epsilon, n_curve, CURVE_SEED)])  # noqa: E731
+    bare, methods = ran["dreamer"], {}
+    for name in ("dreamer", *(f"sqrl_{r:g}" for r in RISKS), "latentsafe", "lookahead"):
+        seeds = [ran[cell] for cell in cells if cell == name or cell[0] == name]
+        methods[name] = {**rates(seeds), "mcnemar_against_dreamer": against(seeds, bare)}
     curves = {
-        "latent safety filter (epsilon)": [{"threshold": e, **at(arguments.filters[0], e)} for e in EPSILONS],
-        "SQRL (risk)": [{"threshold": r, **at(arguments.risks[0], -r)} for r in RISK_CURVE],
+        title: [{"threshold": x, **rates([ran[kind, x]])} for x in thresholds]
+        for title, kind, thresholds in (
+            ("latent safety filter (epsilon)", "epsilon", EPSILONS),
+            ("SQRL (risk)", "risk", RISK_CURVE),
+        )
     }
-    bare_curve = rates([study.bare(n_curve, CURVE_SEED)])
-    save(trade_off(curves, bare_curve), arguments.output_dir / "trade_off.png")
+    no_filter = rates([ran["no filter"]])
+    save(trade_off(curves, no_filter), arguments.output_dir / "trade_off.png")
 
-    found, missed, shown = lead_times(study, arguments.filters[0], n, FIRST_SEED)
+    found, missed, shown = lead_times(ran["watched"])
     lead_row = {"steps": found, "failures_unseen_by_margin": missed}
     if found:
         lead_row |= {"median": float(np.median(found)), "share_of_3_or_more": float(np.mean(np.array(found) >= 3))}
         save(leads(found), arguments.output_dir / "lead.png")
-    if shown:
-        save(unsafe_rollout(*shown, EPSILON, study.env.fps), arguments.output_dir / "unsafe_rollout.png")
-    record = {"methods": methods, "curves": {**curves, "no filter": bare_curve}, "lead": lead_row}
-    write_json(arguments.output_dir / "table2.json", {**record, **provenance(seeds=[FIRST_SEED, FIRST_SEED + n - 1])})
+    if shown is not None:
+        _, frames = run_filmed(cells["watched"][shown])
+        curves_of = (np.array(ran["watched"][shown][name]) for name in ("margin", "value"))
+        figure = unsafe_rollout(frames, *curves_of, EPSILON, SCENES["blocks"].fps)
+        save(figure, arguments.output_dir / "unsafe_rollout.png")
+    record = {"methods": methods, "curves": {**curves, "no filter": no_filter}, "lead": lead_row}
+    minutes = sum(row["cpu_s"] for cell in ran.values() for row in cell) / 60
+    made_by = provenance([FIRST_SEED, FIRST_SEED + arguments.n - 1], minutes)
+    write_json(arguments.output_dir / "table2.json", {**record, **made_by})
     for name, row in methods.items():
         print(name.ljust(12), *(f"{k} {row[k]['k']}/{row[k]['n']}" for k in OUTCOMES), sep="  ")
 

@@ -32,5 +32,5 @@ fi
   done
 
   $BIN/python scripts/blocks_table2.py --dreamer "$OUT/dreamer/policy" --filters "$OUT"/reachability/seed_{0,1,2} \
-    --risks "$OUT"/risk/seed_{0,1,2} --cells "$OUT/cells" $table
+    --risks "$OUT"/risk/seed_{0,1,2} --cells "$OUT/cells.jsonl" --workers="${WORKERS:-1}" $table
 }

@@ -1,4 +1,6 @@
-"""What the blocks study measures beyond rates: the privileged bound, and how long V warns before l does."""
+"""Episodes of the blocks study, bare, filtered and under the privileged bound, and how long V warns before l does."""
+
+from functools import cache, lru_cache
 
 import matplotlib
 
@@ -10,34 +12,75 @@ from lerobot.envs import preprocess_observation
 from matplotlib.figure import Figure
 
 from lerobot_latentsafe.baselines.simulator import SimulatorLookahead
+from lerobot_latentsafe.checkpoint import read_config, resolve_checkpoint
+from lerobot_latentsafe.envs.configuration_envs import LatentSafeBlocksEnv
 from lerobot_latentsafe.envs.franka_env import BlocksEnv
-from lerobot_latentsafe.evaluation.shielding import Episodes
+from lerobot_latentsafe.evaluation.shielding import check_environment
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.shield import BasePolicy
 from lerobot_latentsafe.world_models.base import Latent
 
 
-def lookahead_episodes(base: BasePolicy, n_episodes: int, seed: int) -> Episodes:
-    """A policy under `SimulatorLookahead`, from the starts of `run_episodes` with the same seed."""
-    env = BlocksEnv()
-    look_ahead, outcomes = SimulatorLookahead(env.scene), []
-    for episode in range(n_episodes):
-        observation, info = env.reset(seed=seed + episode)
-        base.reset()
-        overridden, change, truncated = 0, 0.0, False
-        while not truncated:
-            batch = {**preprocess_observation(observation), "task": [env.task]}
-            proposed = base.propose(batch)[0].cpu().numpy()
-            action, retreated = look_ahead(proposed)
+@cache
+def _env() -> BlocksEnv:
+    return BlocksEnv()
+
+
+@lru_cache(maxsize=1)
+def load(dreamer: str, filter: str | None, mode: str, epsilon: float | None) -> BasePolicy | LatentSafePolicy:
+    """The task policy, under a filter if there is one, by their paths; of a risk critic, epsilon is -eps_risk."""
+    torch.set_num_threads(1)
+    if filter is None:
+        return BasePolicy(dreamer, "cpu")
+    config = read_config(resolve_checkpoint(filter))
+    config.device, config.mode, config.epsilon = "cpu", mode, epsilon
+    policy = LatentSafePolicy.from_pretrained(filter, config=config)
+    policy.attach(dreamer)
+    check_environment(policy, LatentSafeBlocksEnv())
+    return policy
+
+
+def run(job: dict) -> dict:
+    """One episode; the job holds seed, mode, and what `load` takes.
+
+    Modes: bare; filter; lookahead, the filter that knows the simulator; monitor, in which a filter only looks on.
+
+    Returns:
+        success, violation, steps, overridden; of a violation that was looked on at, also margin and value, l and V of
+        each step.
+    """
+    return run_filmed(job)[0]
+
+
+@torch.no_grad()
+def run_filmed(job: dict) -> tuple[dict, list[np.ndarray]]:
+    """The row of `run`, and the front camera's pictures."""
+    env, actor = _env(), load(job["dreamer"], job["filter"], job["mode"], job["epsilon"])
+    torch.manual_seed(job["seed"])
+    look_ahead = SimulatorLookahead(env.scene)
+    observation, info = env.reset(seed=job["seed"])
+    actor.reset()
+    frames, latents, overridden, truncated = [], [], 0, False
+    while not truncated:
+        frames.append(observation["pixels"]["front"])
+        batch = {**preprocess_observation(observation), "task": [env.task]}
+        retreated = False
+        if isinstance(actor, LatentSafePolicy):
+            decision = actor.decide(batch)
+            action, retreated = decision.action[0].numpy(), bool(decision.intervened)
+            latents.append(actor.shield.latent)
+        else:
+            action = actor.propose(batch)[0].numpy()
+        if job["mode"] == "lookahead":
+            action, retreated = look_ahead(action)
             if retreated:
-                base.replan(torch.from_numpy(action).float()[None])
-            overridden, change = overridden + retreated, change + float(np.linalg.norm(action - proposed))
-            observation, _, _, truncated, info = env.step(action)
-        outcomes.append((info["is_success"], info["failure"], env.steps, overridden, change))
-    env.close()
-    success, violation, steps, overridden, change = map(np.array, zip(*outcomes))
-    success, violation = success.astype(bool), violation.astype(bool)
-    return Episodes(success & ~violation, violation, steps, overridden, change, np.full(n_episodes, np.nan))
+                actor.replan(torch.from_numpy(action).float()[None])
+        overridden += retreated
+        observation, _, _, truncated, info = env.step(action)
+    row = {"success": info["is_success"], "violation": info["failure"], "steps": env.steps, "overridden": overridden}
+    if job["mode"] == "monitor" and info["failure"]:
+        row |= {name: column.tolist() for name, column in zip(("margin", "value"), values_along(actor, latents))}
+    return row, frames
 
 
 @torch.no_grad()
