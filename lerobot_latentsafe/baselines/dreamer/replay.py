@@ -111,15 +111,13 @@ class Replay:
         return cls(arrays, percepts, arrays.pop("written"), length)
 
     def write(self, i: int, episode: dict[str, np.ndarray]) -> None:
-        """Store episode i."""
+        """Store episode i. A killed process loses nothing of it: the system keeps mapped pages."""
         frames = slice(i * self.length, (i + 1) * self.length)
         for name, values in episode.items():
             self.arrays[name][frames] = values
-            self.arrays[name].flush()
         for key, pictures in self.percepts.items():
             pictures[frames] = torch.from_numpy(episode[key]).to(pictures.device)
         self.written[i] = True
-        self.written.flush()
 
     def reader(self, n_episodes: int, clip_length: int) -> ClipReader:
         """Clips of the first so many episodes."""
