@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 AIM = "aim.safetensors"
 """The network, beside the dataset that it was learned on."""
 KEYPOINTS, HIDDEN, DROPOUT = 16, 128, 0.1
-STEPS, LEARNING_RATE = 2000, 3e-3
+STEPS, LEARNING_RATE = 4000, 3e-3
 MOSTLY, RARELY = 112, 16
 """Frames of a batch from before the fingers close, the few that matter, and of any frames."""
 
@@ -83,7 +83,8 @@ class Aim(nn.Module):
         self.move_mean.copy_(move[before].mean(0))
         self.move_std.copy_(move[before].std(0).clamp(min=1e-3))
         for _ in trange(STEPS, desc="aim", unit="step"):
-            rows = torch.cat([before[torch.randint(len(before), (MOSTLY,))], torch.randint(len(state), (RARELY,))])
+            drawn, any_frames = torch.randint(len(before), (MOSTLY,)), torch.randint(len(state), (RARELY,))
+            rows = torch.cat([before[drawn.to(before.device)], any_frames.to(before.device)])
             error = (self(tokens[rows], state[rows]) - move[rows]) / self.move_std
             loss = error.square().mean()
             optimizer.zero_grad()
@@ -165,11 +166,19 @@ def until_switched(state: np.ndarray, command: np.ndarray, episode: np.ndarray) 
     return np.where(known[:, None], state[there] - state, 0.0).astype(np.float32)
 
 
+@torch.no_grad()
+def foreseen(aim: Aim, tokens: Tensor, state: Tensor) -> Tensor:
+    """The motions (N, M) of many frames, in batches."""
+    return torch.cat([aim(*rows) for rows in zip(tokens.split(512), state.split(512))])
+
+
 def with_aim(
     cache_root: str | Path, repo_id: str, output_dir: str | Path, switch: str = "gripper.pos",
-    moved: Sequence[str] = ("ee_x.pos", "ee_y.pos", "ee_z.pos", "ee_rz.pos"),
+    moved: Sequence[str] = ("ee_x.pos", "ee_y.pos", "ee_z.pos", "ee_rz.pos"), device: str = "cpu",
 ) -> "LeRobotDataset":  # fmt: skip
-    """Copy a token-cached dataset with the aim of each frame, learned from it, as a column that policies read.
+    """Copy a token-cached dataset with the aim of each frame as a column that policies read, and the network beside it.
+
+    The aims of every other episode are foreseen by a network that learned from the rest.
 
     Args:
         switch: the command whose falling, such as the fingers' closing, is aimed at.
@@ -177,7 +186,7 @@ def with_aim(
 
     Raises:
         FrameCacheError: the cache holds no tokens.
-        ValueError: no such command, or it never falls.
+        ValueError: no such command, or it hardly ever falls.
     """
     from lerobot.datasets.dataset_tools import add_features
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -196,20 +205,29 @@ def with_aim(
         )
     episode = np.asarray(dataset.hf_dataset.with_format("numpy")["episode_index"])
     where = cache.state[:, [states.index(name) for name in moved]]
-    move = until_switched(where, cache.action[:, names.index(switch)], episode)
-    if not move.any():
-        raise ValueError(f"{switch} never falls in {repo_id}; record demonstrations that grasp something")
-    torch.manual_seed(0)
+    move = torch.from_numpy(until_switched(where, cache.action[:, names.index(switch)], episode)).to(device)
+    odd = torch.from_numpy(episode % 2 == 1).to(device)
+    if not (move[odd].any() and move[~odd].any()):
+        raise ValueError(f"{switch} hardly ever falls in {repo_id}; record more demonstrations, that grasp something")
     (percepts, state), n_cameras = cache.frames(np.arange(len(move)), ["tokens"]), len(cache.manifest["cameras"])
-    aim = Aim(n_cameras, *percepts["tokens"].shape[1:], state.shape[1], len(moved))
-    aim.fit(percepts["tokens"], state, torch.from_numpy(move))
-    with torch.no_grad():
-        seen = torch.cat([aim(*rows) for rows in zip(percepts["tokens"].split(512), state.split(512))])
+    tokens, state = percepts["tokens"].to(device), state.to(device)
+
+    def learned_from(frames: Tensor) -> Aim:
+        torch.manual_seed(0)
+        aim = Aim(n_cameras, *tokens.shape[1:], state.shape[1], len(moved)).to(device)
+        aim.fit(tokens[frames], state[frames], move[frames])
+        return aim
+
+    # A policy is to learn from aims as wrong as it will live by: those of frames that the network did not learn from.
+    seen = torch.empty(len(move), len(moved))
+    for half in (odd, ~odd):
+        seen[half.cpu()] = foreseen(learned_from(~half), tokens[half], state[half]).cpu()
+    aim = learned_from(torch.ones_like(odd))
     feature = {"dtype": "float32", "shape": (seen.shape[1],), "names": None}
     copy = add_features(
         dataset, {OBS_ENV_STATE: (seen.numpy(), feature)}, output_dir=output_dir, repo_id=f"{repo_id}_seen"
     )
-    save_file(aim.state_dict(), Path(output_dir) / AIM)
+    save_file(aim.cpu().state_dict(), Path(output_dir) / AIM)
     return copy
 
 
@@ -233,17 +251,19 @@ def let_see(checkpoint: str | Path, cache_root: str | Path, seen: str | Path, ou
         raise FileExistsError(f"{output_dir} exists; choose another folder or delete it")
     manifest = FrameCache.open(cache_root).manifest
     config, cameras = PreTrainedConfig.from_pretrained(checkpoint), sorted(manifest["cameras"])
+    config.device = "cpu"  # wherever it was trained; commands choose another by --policy.device
     step = PerceiveStep(
         manifest["encoder"], manifest["encoder_hash"], manifest["image_size"], cameras,
         config.robot_state_feature.shape[0], config.env_state_feature.shape[0],
     )  # fmt: skip
     step.load_state_dict(load_file(Path(seen) / AIM))
-    pre, post = make_pre_post_processors(config, pretrained_path=checkpoint)
+    elsewhere = {"device_processor": {"device": "cpu"}}
+    pre, post = make_pre_post_processors(config, pretrained_path=checkpoint, preprocessor_overrides=elsewhere)
     # After images are batched and on the device, before anything is normalised.
     at = next(i for i, s in enumerate(pre.steps) if isinstance(s, DeviceProcessorStep)) + 1
     pre.steps.insert(at, step)
     output_dir.mkdir(parents=True)
-    for name in ("config.json", "model.safetensors"):
-        shutil.copyfile(checkpoint / name, output_dir / name)
+    config.save_pretrained(output_dir)
+    shutil.copyfile(checkpoint / "model.safetensors", output_dir / "model.safetensors")
     for pipeline in (pre, post):
         pipeline.save_pretrained(output_dir)

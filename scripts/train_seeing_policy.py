@@ -73,18 +73,20 @@ def main() -> None:
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--steps", type=int)
     parser.add_argument("--seed", type=int)
+    parser.add_argument("--device", default="cpu", help="to train on")
     arguments = parser.parse_args()
     repo_id = arguments.repo_id or f"latentsafe/{arguments.dataset.name}"
     LeRobotDatasetMetadata(repo_id, root=arguments.dataset)  # refuse what is no dataset before any work
     beside = {what: arguments.dataset.with_name(f"{arguments.dataset.name}_{what}") for what in ("tokens", "seen")}
     if not (beside["tokens"] / FOLDER / MANIFEST).exists():
-        command = [Path(sys.executable).parent / "latentsafe", "cache", "--encoder=auto"]
+        command = [sys.executable, "-m", "lerobot_latentsafe.cli", "cache", "--encoder=auto"]
         command += [f"--dataset.repo_id={repo_id}", f"--dataset.root={arguments.dataset}"]
-        subprocess.run([*map(str, command), f"--output_dir={beside['tokens']}"], check=True)
+        subprocess.run([*command, f"--output_dir={beside['tokens']}"], check=True)
     if not (beside["seen"] / AIM).exists():
-        with_aim(beside["tokens"], f"{repo_id}_cache", beside["seen"])
+        with_aim(beside["tokens"], f"{repo_id}_cache", beside["seen"], device=arguments.device)
     config = draccus.parse(TrainPipelineConfig, CONFIG, args=[])
     config.steps, config.seed = arguments.steps or config.steps, arguments.seed or config.seed
+    config.policy.device = arguments.device
     dataset = LeRobotDataset(f"{repo_id}_cache_seen", root=beside["seen"])
     trained = train(config, dataset, arguments.output.with_name(f"{arguments.output.name}_training"))
     let_see(trained, beside["tokens"], beside["seen"], arguments.output)

@@ -58,13 +58,13 @@ GRASPED = {"open_end": bag.MOUTH, "middle": bag.MIDDLE, "closed_end": bag.TAIL}
 """Behaviour -> the segment that it lifts the bag by."""
 
 
-def grasp(scene: bag.BagScene, segment: int, rng: np.random.Generator) -> Actions:
-    """Close the fingers on a segment of the bag."""
+def grasp(scene: bag.BagScene, segment: int, rng: np.random.Generator, speed: float = MAX_SPEED) -> Actions:
+    """Close the fingers on a segment of the bag, approached at a speed in m/s."""
     above = scene.segment_position(segment) + np.append(rng.normal(0, 0.003, 2), 0)
     yaw = scene.yaw + rng.normal(0, 0.05)
     height = np.clip(scene.controller.position[2], 0.05, 0.12)  # a hand that is low already is put right down there
-    yield from reach(scene, np.append(above[:2], height), MAX_SPEED, OPEN, yaw)
-    yield from reach(scene, np.append(above[:2], 0.028), 0.3, OPEN)
+    yield from reach(scene, np.append(above[:2], height), speed, OPEN, yaw)
+    yield from reach(scene, np.append(above[:2], 0.028), speed, OPEN)
     yield from hold(CLOSED, 9)
 
 
@@ -79,8 +79,8 @@ def stray(scene: bag.BagScene, segment: int, rng: np.random.Generator) -> Action
 
 
 def lift(scene: bag.BagScene, segment: int, speed: float, rng: np.random.Generator) -> Actions:
-    """Grasp a segment, lift it and hold it up."""
-    yield from grasp(scene, segment, rng)
+    """Grasp a segment, slowly enough to be learned from, lift it and hold it up."""
+    yield from grasp(scene, segment, rng, 0.18)
     yield from reach(scene, scene.controller.position + up(rng.uniform(0.20, 0.26)), speed, CLOSED)
     yield from hold(CLOSED, 15)
 
