@@ -71,12 +71,16 @@ class Collect:
     n_episodes: int | None = None
     """None: 2,000 of the car, and as many of the Franka as the source says."""
     seed: int = 0
+    workers: int = 1
+    """Processes that record the Franka."""
 
     def run(self) -> None:
+        from functools import partial
+
         from lerobot_latentsafe.datasets import collect, collect_franka
 
         if self.source in collect_franka.SOURCES:
-            record = collect_franka.collect_franka
+            record = partial(collect_franka.collect_franka, workers=self.workers)
         elif self.source in collect.SOURCES:
             record = collect.collect_dubins
         else:

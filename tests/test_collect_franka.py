@@ -58,6 +58,18 @@ def test_a_killed_recording_goes_on_and_equals_an_undisturbed_one(tiny, tmp_path
     assert dataset.meta.info.robot_type == "latentsafe_franka_mujoco" and dataset.num_frames == 120
 
 
+def test_several_workers_record_the_same(tiny, tmp_path, monkeypatch):
+    from multiprocessing.dummy import Pool
+    from types import SimpleNamespace
+
+    alone = columns(collect("tiny", "me/tiny", tmp_path / "alone", 2, seed=0))
+    # A thread in place of processes, which would not know of the tiny source.
+    monkeypatch.setattr(collect_franka, "get_context", lambda method: SimpleNamespace(Pool=lambda workers: Pool(1)))
+    together = columns(collect("tiny", "me/tiny", tmp_path / "together", 2, seed=0, workers=2))
+    for name in COLUMNS:
+        np.testing.assert_array_equal(together[name], alone[name])
+
+
 def test_branches_share_their_grasp_and_differ_after_it():
     from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
     from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco

@@ -1,13 +1,16 @@
 """Recording the simulated Franka in bulk, through the same robot and operators as lerobot-record.
 
-Episodes are recorded in parts of a few dozen, each a finished dataset of its own in `<root>.parts`, and put together at
-the end: a run that was killed goes on where its last finished part ends, and never leaves a broken dataset.
-Episode i depends on the seed and i only.
+Episodes are recorded in parts of a few dozen, each a finished dataset of its own in `<root>.parts`, by one process or
+several, and put together at the end: a run that was killed goes on with the parts that are missing, and never leaves a
+broken dataset. Episode i depends on the seed and i only.
 """
 
 import shutil
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -84,11 +87,14 @@ def features(source: Source) -> dict:
     }
 
 
-def collect_franka(name: str, repo_id: str, root: str | Path, n_episodes: int | None, seed: int) -> "LeRobotDataset":
+def collect_franka(
+    name: str, repo_id: str, root: str | Path, n_episodes: int | None, seed: int, workers: int = 1
+) -> "LeRobotDataset":
     """Record a source, or go on recording it.
 
     Args:
         n_episodes: None takes the source's.
+        workers: processes that record.
 
     Raises:
         ValueError: unknown source, or an unfinished recording of another source, seed or repo_id.
@@ -106,16 +112,13 @@ def collect_franka(name: str, repo_id: str, root: str | Path, n_episodes: int | 
         raise FileExistsError(f"{root} exists; choose another --root or delete it")
     parts = root.with_name(root.name + ".parts")
     _claim(parts, f"{name} {repo_id} seed {seed}")
-    starts = range(0, n_episodes, EPISODES_A_PART)
-    for start in tqdm(starts, desc=f"collecting {name}", unit="part"):
-        end = min(start + EPISODES_A_PART, n_episodes)
-        part = parts / f"{start:06d}_{end:06d}"
-        if not part.exists():
-            unfinished = parts / "unfinished"
-            shutil.rmtree(unfinished, ignore_errors=True)
-            _record_part(source, repo_id, unfinished, range(start, end), seed)
-            unfinished.rename(part)
-    folders = [parts / f"{start:06d}_{min(start + EPISODES_A_PART, n_episodes):06d}" for start in starts]
+    size = min(EPISODES_A_PART, -(-n_episodes // workers))
+    episodes = [range(start, min(start + size, n_episodes)) for start in range(0, n_episodes, size)]
+    record = partial(_record_part, source, repo_id, parts, seed=seed)
+    with ExitStack() as stack:
+        # Spawned: a process that was forked cannot draw.
+        apply = stack.enter_context(get_context("spawn").Pool(workers)).imap if workers > 1 else map
+        folders = list(tqdm(apply(record, episodes), desc=f"collecting {name}", total=len(episodes), unit="part"))
     together = parts / "together"
     shutil.rmtree(together, ignore_errors=True)
     aggregate_datasets([repo_id] * len(folders), repo_id, roots=folders, aggr_root=together)
@@ -133,15 +136,21 @@ def _claim(parts: Path, what: str) -> None:
     note.write_text(what)
 
 
-def _record_part(source: Source, repo_id: str, root: Path, episodes: range, seed: int) -> None:
+def _record_part(source: Source, repo_id: str, parts: Path, episodes: range, seed: int) -> Path:
+    """The finished dataset of some episodes, recorded unless it is there."""
     from lerobot.configs.video import RGBEncoderConfig
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
     from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
 
+    part = parts / f"{episodes.start:06d}_{episodes.stop:06d}"
+    if part.exists():
+        return part
+    unfinished = part.with_suffix(".unfinished")
+    shutil.rmtree(unfinished, ignore_errors=True)
     dataset = LeRobotDataset.create(
-        repo_id, SCENES[source.scene].fps, features(source), root=root, robot_type=LatentSafeFrankaMujoco.name,
+        repo_id, SCENES[source.scene].fps, features(source), root=unfinished, robot_type=LatentSafeFrankaMujoco.name,
         streaming_encoding=True, encoder_threads=1, metadata_buffer_size=EPISODES_A_PART,
         rgb_encoder=RGBEncoderConfig(vcodec="h264", preset="veryfast", crf=20),
     )  # fmt: skip
@@ -152,6 +161,7 @@ def _record_part(source: Source, repo_id: str, root: Path, episodes: range, seed
                 dataset.add_frame(frame)
             dataset.save_episode()
     dataset.finalize()
+    return unfinished.rename(part)
 
 
 def episode_frames(robot: "LatentSafeFrankaMujoco", source: Source, episode: int, seed: int) -> Iterator[dict]:
