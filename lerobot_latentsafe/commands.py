@@ -29,7 +29,12 @@ class DatasetSource:
         """Metadata of a dataset whose files are on this machine: one without a folder is fetched from the Hub."""
         from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-        return self.metadata() if self.root else LeRobotDataset(self.repo_id).meta
+        if self.root:
+            return self.metadata()
+        try:
+            return LeRobotDataset(self.repo_id).meta
+        except OSError as e:
+            raise OSError(f"{e} If {self.repo_id} is on this machine, give its folder: --dataset.root=...") from e
 
 
 @dataclass

@@ -1,4 +1,5 @@
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -32,6 +33,14 @@ def test_report_shows_rates_curves_and_imagination(page):
     assert "95% intervals" in page and "/3 = " in page and "epsilon = 0.3" in page
     assert "imagined" in page or "never saw a reason" in page
     assert "not a certified safety device" in page
+
+
+def test_report_on_a_recording_without_a_filter_is_refused(tiny_filter, tmp_path):
+    plain = SimpleNamespace(root=tmp_path, meta=SimpleNamespace(repo_id="me/cup"))
+    policy = LatentSafePolicy.from_pretrained(tiny_filter)
+    with pytest.raises(ValueError, match="me/cup was not recorded under a filter"):
+        write_filter_report(tmp_path / "report.html", policy, None, 2, 0, plain)
+    assert not (tmp_path / "report.html").exists()
 
 
 class Still(BasePolicy):

@@ -38,8 +38,16 @@ def write_filter_report(
         env: with a base policy, the policy is run there first, bare and shielded from the same starts.
         recorded: a dataset; what `latentsafe record` stored is shown, and where the world model cannot draw, its frames
             illustrate what was imagined, beside those of the episodes that are run.
+
+    Raises:
+        ValueError: nothing is run, and the dataset was not recorded under a filter.
     """
     policy.require_stage(policy.needed_stage)
+    if recorded is not None and env is None and not Recording.is_one(recorded):
+        raise ValueError(
+            f"{recorded.meta.repo_id} was not recorded under a filter (latentsafe record), so nothing tells what one "
+            "changed; record under it, give --env.type as well, or ask latentsafe check-labels what it thinks of these"
+        )
     album = None if hasattr(policy.world_model, "decode") else Album(policy)
     if album is not None and recorded is not None:
         album.add_dataset(recorded)
