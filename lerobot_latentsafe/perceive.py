@@ -14,7 +14,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from lerobot.configs import FeatureType, PipelineFeatureType, PolicyFeature
-from lerobot.processor import DeviceProcessorStep, ObservationProcessorStep, ProcessorStepRegistry
+from lerobot.processor import (
+    DeviceProcessorStep,
+    ObservationProcessorStep,
+    PolicyActionProcessorStep,
+    ProcessorStepRegistry,
+)
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from torch import Tensor, nn
 from tqdm import trange
@@ -152,6 +157,43 @@ class PerceiveStep(ObservationProcessorStep):
         return {**features, PipelineFeatureType.OBSERVATION: observed}
 
 
+@ProcessorStepRegistry.register("latentsafe_two_valued")
+class TwoValuedStep(PolicyActionProcessorStep):
+    """Commands that only ever took two values in the demonstrations, as of fingers, are given as the nearer one.
+
+    A denoised command falls a little short of them. The robot follows, and a policy that reads how far its fingers have
+    closed, never having seen them in between, takes that for the beginning of a grasp, and closes on nothing.
+
+    Args:
+        levels: index of a command -> its two values.
+    """
+
+    def __init__(self, levels: dict[str, tuple[float, float]]):
+        self.levels = levels
+
+    def action(self, action: Tensor) -> Tensor:
+        """(..., A) -> (..., A)."""
+        action = action.clone()
+        for index, (low, high) in self.levels.items():
+            command = action[..., int(index)]
+            action[..., int(index)] = torch.where(command < (low + high) / 2, low, high)
+        return action
+
+    def get_config(self) -> dict[str, Any]:
+        return {"levels": self.levels}
+
+    def transform_features(
+        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
+    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
+        return features
+
+
+def two_valued(action: np.ndarray) -> dict[str, tuple[float, float]]:
+    """Which commands of (N, A) take two values alone, and those."""
+    values = {str(i): np.unique(column) for i, column in enumerate(action.T)}
+    return {i: (float(found[0]), float(found[1])) for i, found in values.items() if len(found) == 2}
+
+
 def until_switched(state: np.ndarray, command: np.ndarray, episode: np.ndarray) -> np.ndarray:
     """How a state (N, M) changes until a command (N,) next falls below the middle of its range: (N, M).
 
@@ -249,7 +291,8 @@ def let_see(checkpoint: str | Path, cache_root: str | Path, seen: str | Path, ou
     checkpoint, output_dir = Path(checkpoint), Path(output_dir)
     if output_dir.exists():
         raise FileExistsError(f"{output_dir} exists; choose another folder or delete it")
-    manifest = FrameCache.open(cache_root).manifest
+    cache = FrameCache.open(cache_root)
+    manifest = cache.manifest
     config, cameras = PreTrainedConfig.from_pretrained(checkpoint), sorted(manifest["cameras"])
     config.device = "cpu"  # wherever it was trained; commands choose another by --policy.device
     step = PerceiveStep(
@@ -262,6 +305,8 @@ def let_see(checkpoint: str | Path, cache_root: str | Path, seen: str | Path, ou
     # After images are batched and on the device, before anything is normalised.
     at = next(i for i, s in enumerate(pre.steps) if isinstance(s, DeviceProcessorStep)) + 1
     pre.steps.insert(at, step)
+    if levels := two_valued(cache.action):
+        post.steps.append(TwoValuedStep(levels))
     output_dir.mkdir(parents=True)
     config.save_pretrained(output_dir)
     shutil.copyfile(checkpoint / "model.safetensors", output_dir / "model.safetensors")

@@ -11,7 +11,7 @@ from safetensors.torch import load_file
 from lerobot_latentsafe import perceive
 from lerobot_latentsafe.datasets.frame_cache import FrameCache, FrameCacheError
 from lerobot_latentsafe.envs.dubins import ACTION_NAMES, STATE_NAMES
-from lerobot_latentsafe.perceive import Aim, PerceiveStep, let_see, until_switched, with_aim
+from lerobot_latentsafe.perceive import Aim, PerceiveStep, TwoValuedStep, let_see, two_valued, until_switched, with_aim
 from lerobot_latentsafe.shield import BasePolicy
 
 REPO_ID = tiny.REPO_ID + "_cache"
@@ -103,6 +103,14 @@ def test_commands_that_cannot_be_aimed_at_are_named(token_root, tmp_path):
         with_aim(token_root, REPO_ID, tmp_path / "seen")
     with pytest.raises(ValueError, match=f"{ACTION_NAMES[1]} hardly ever falls"):
         with_aim(token_root, REPO_ID, tmp_path / "seen", switch=ACTION_NAMES[1], moved=STATE_NAMES)
+
+
+def test_commands_of_two_values_are_given_as_the_nearer_one():
+    shown = np.array([[0.1, 1.0, 5.0], [0.2, 0.0, 5.0], [0.3, 1.0, 5.0]], np.float32)
+    levels = two_valued(shown)
+    assert levels == {"1": (0.0, 1.0)}
+    action = TwoValuedStep(levels).action(torch.tensor([[0.15, 0.94, 4.0], [0.25, 0.07, 4.0]]))
+    torch.testing.assert_close(action, torch.tensor([[0.15, 1.0, 4.0], [0.25, 0.0, 4.0]]))
 
 
 def test_missing_camera_is_named(seeing):
