@@ -167,7 +167,7 @@ class LatentSafePolicy(PreTrainedPolicy):
         if self.device.type == "cpu":
             keep_freed_memory()
         loss, _, metrics = self.clip_loss(self.reader.read(batch, self))
-        return loss, {name: float(value) for name, value in metrics.items()}
+        return loss, {name: torch.as_tensor(value).item() for name, value in metrics.items()}
 
     def clip_loss(self, clip: Clip) -> tuple[Tensor, Tensor, dict[str, Tensor | float]]:
         """The loss of a clip, the features (B, T, D) of its frames, and metrics."""

@@ -243,13 +243,12 @@ class BasePolicy:
     """
 
     def __init__(self, path: str | Path, device: str, ahead: int = 0):
-        from lerobot.configs.policies import PreTrainedConfig
         from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
-        from lerobot_latentsafe.checkpoint import CheckpointError, resolve_checkpoint
+        from lerobot_latentsafe.checkpoint import CheckpointError, read_config, resolve_checkpoint
 
         self.path = resolve_checkpoint(path)
-        config = PreTrainedConfig.from_pretrained(self.path)
+        config = read_config(self.path)
         if config.type == "latentsafe":
             raise ValueError(
                 f"base policy {path} is itself a latentsafe filter; shields do not nest. "

@@ -15,6 +15,7 @@ from lerobot_latentsafe import LatentSafeConfig, LatentSafeDubinsEnv
 from lerobot_latentsafe.checkpoint import CheckpointError, resolve_checkpoint, seal
 from lerobot_latentsafe.filter import Reason
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, UntrainedFilterError, adopt_dataset
+from lerobot_latentsafe.shield import BasePolicy
 from lerobot_latentsafe.training import save_filter, train_reachability
 
 load = LatentSafePolicy.from_pretrained
@@ -97,6 +98,14 @@ def test_unreadable_config_is_refused(filter_copy, content):
     config.unlink() if content is None else config.write_text(content)
     with pytest.raises(CheckpointError, match=r"config\.json"):
         load(filter_copy)
+
+
+@pytest.mark.parametrize("content", [None, '{"type": "diffusion", "hor'], ids=["missing", "truncated"])
+def test_unreadable_config_of_a_base_policy_is_refused(tmp_path, content):
+    if content is not None:
+        (tmp_path / "config.json").write_text(content)
+    with pytest.raises(CheckpointError, match=r"config\.json"):
+        BasePolicy(tmp_path, "cpu")
 
 
 def test_stage_edited_by_hand_trains_no_critic(tiny_world_model, tmp_path):

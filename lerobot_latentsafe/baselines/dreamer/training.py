@@ -121,7 +121,7 @@ class DreamerTraining:
             metrics = self.update()
             self.step += 1
             if self.step % options.log_every == 0:
-                self._note({name: float(value) for name, value in metrics.items()})
+                self._note({name: torch.as_tensor(value).item() for name, value in metrics.items()})
             if self.step % options.save_every == 0 or self.step == options.steps:
                 self._save()
         self.policy.eval()
