@@ -68,14 +68,6 @@ def grasp(scene: bag.BagScene, segment: int, rng: np.random.Generator, speed: fl
     yield from hold(CLOSED, 9)
 
 
-def unsteady(actions: Actions, rng: np.random.Generator) -> Actions:
-    """The same by a hand that drifts sideways as it goes up or down: how it is brought back is to be learned from."""
-    drift = np.zeros(2)
-    for action in actions:
-        drift = 0.8 * drift + rng.normal(0, 0.35, 2)
-        yield action + np.append(drift * abs(action[2]), np.zeros(5))
-
-
 def stray(scene: bag.BagScene, segment: int, rng: np.random.Generator) -> Actions:
     """Go where a policy may find itself that went astray: above the bag, or low and close to the segment it wants."""
     if rng.random() < 0.4:
@@ -88,7 +80,7 @@ def stray(scene: bag.BagScene, segment: int, rng: np.random.Generator) -> Action
 
 def lift(scene: bag.BagScene, segment: int, speed: float, rng: np.random.Generator) -> Actions:
     """Grasp a segment, slowly enough to be learned from, lift it and hold it up."""
-    yield from unsteady(grasp(scene, segment, rng, 0.18), rng)
+    yield from grasp(scene, segment, rng, 0.18)
     yield from reach(scene, scene.controller.position + up(rng.uniform(0.20, 0.26)), speed, CLOSED)
     yield from hold(CLOSED, 15)
 
