@@ -2,6 +2,8 @@
 .PHONY: setup demo demo-bag test lint results
 
 PYTHON = .venv/bin/python
+# Tests and commands start many processes: without kept bytecode each would compile all that it imports.
+unexport PYTHONDONTWRITEBYTECODE
 
 setup:
 	@scripts/setup.sh
