@@ -27,11 +27,12 @@ def test_guess_is_the_split_that_fits_best(margin, first):
     assert best_split(np.array(margin, float)) == first
 
 
-def test_certain_episodes_teach_little_uncertain_and_contradictory_ones_much():
-    certain = Suggestion.of(np.r_[np.ones(20), -np.ones(20)])
-    uncertain = Suggestion.of(np.r_[np.ones(20), 0.1 * np.ones(5), -np.ones(20)])
-    contradictory = Suggestion.of(np.r_[np.ones(20), -np.ones(20), np.ones(8)])
-    assert certain.usefulness == 0.0 < uncertain.usefulness < 0.5 < contradictory.usefulness
+def test_doubtful_failures_teach_most_and_surely_safe_episodes_nothing():
+    safe, failing = Suggestion.of(np.ones(40)), Suggestion.of(np.r_[np.ones(20), -np.ones(20)])
+    border = Suggestion.of(np.r_[np.ones(20), 0.1 * np.ones(5), np.ones(20)])
+    doubtful = Suggestion.of(np.r_[np.ones(20), -0.5 * np.ones(5), np.ones(20)])
+    assert safe.usefulness == 0.0 < border.usefulness < failing.usefulness < doubtful.usefulness == 1.0
+    assert 0 <= Suggestion.of(np.array([0.3])).usefulness <= 1  # shorter than what is judged
 
 
 def test_contradiction_counts_labelled_frames_only():
