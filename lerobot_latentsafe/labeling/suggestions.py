@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 WORST = 5
 """Frames an episode is judged by: a short doubt in a long certain episode counts."""
 DOUBTFUL = -0.5
-"""Bounded margin of a failure that is seen but doubted. Failures are rare, and what a margin fitted to few labels misses
-is whole failures: such episodes teach it more than those on its border, most of which turn out safe."""
+"""Bounded margin of a failure that is seen but doubted. Failures are rare, and a margin fitted to few labels misses
+whole ones: such episodes teach it more than those on its border, most of which turn out safe."""
 
 
 @dataclass(frozen=True)
