@@ -31,6 +31,8 @@ AIM = "aim.safetensors"
 """The network, beside the dataset that it was learned on."""
 KEYPOINTS, HIDDEN, DROPOUT = 16, 128, 0.1
 STEPS, LEARNING_RATE = 4000, 3e-3
+SMALL = 0.2
+"""Motions below this share of their deviation are shown enlarged: a policy that goes down 20 mm beside is of no use."""
 MOSTLY, RARELY = 112, 16
 """Frames of a batch from before the fingers close, the few that matter, and of any frames."""
 
@@ -74,6 +76,10 @@ class Aim(nn.Module):
         ]
         moves = self.head(torch.cat([*points, (state - self.state_mean) / self.state_std], -1))
         return moves * self.move_std + self.move_mean
+
+    def in_detail(self, moves: Tensor) -> Tensor:
+        """Motions (N, M) as policies read them (N, 2M): as they are, and enlarged where they are small."""
+        return torch.cat([moves, (moves / (SMALL * self.move_std)).tanh()], -1)
 
     def fit(self, tokens: Tensor, state: Tensor, move: Tensor) -> None:
         """Learn from frames: tokens (N, P, C), proprioception (N, S), the motion that came (N, M)."""
@@ -132,7 +138,8 @@ class PerceiveStep(ObservationProcessorStep):
             )
         images = {key: to_model_images(observation[key], perception.image_size) for key in perception.image_keys}
         tokens = perception.tokens(images)
-        return {**observation, OBS_ENV_STATE: self.aim.to(tokens.device)(tokens, observation[OBS_STATE])}
+        aim = self.aim.to(tokens.device)
+        return {**observation, OBS_ENV_STATE: aim.in_detail(aim(tokens, observation[OBS_STATE]))}
 
     def get_config(self) -> dict[str, Any]:
         return {
@@ -152,7 +159,7 @@ class PerceiveStep(ObservationProcessorStep):
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
     ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        seen = PolicyFeature(FeatureType.ENV, (self.sizes["n_moves"],))
+        seen = PolicyFeature(FeatureType.ENV, (2 * self.sizes["n_moves"],))
         observed = {**features.get(PipelineFeatureType.OBSERVATION, {}), OBS_ENV_STATE: seen}
         return {**features, PipelineFeatureType.OBSERVATION: observed}
 
@@ -264,12 +271,13 @@ def with_aim(
     seen = torch.empty(len(move), len(moved))
     for half in (odd, ~odd):
         seen[half.cpu()] = foreseen(learned_from(~half), tokens[half], state[half]).cpu()
-    aim = learned_from(torch.ones_like(odd))
+    aim = learned_from(torch.ones_like(odd)).cpu()
+    seen = aim.in_detail(seen)
     feature = {"dtype": "float32", "shape": (seen.shape[1],), "names": None}
     copy = add_features(
         dataset, {OBS_ENV_STATE: (seen.numpy(), feature)}, output_dir=output_dir, repo_id=f"{repo_id}_seen"
     )
-    save_file(aim.cpu().state_dict(), Path(output_dir) / AIM)
+    save_file(aim.state_dict(), Path(output_dir) / AIM)
     return copy
 
 
@@ -297,7 +305,7 @@ def let_see(checkpoint: str | Path, cache_root: str | Path, seen: str | Path, ou
     config.device = "cpu"  # wherever it was trained; commands choose another by --policy.device
     step = PerceiveStep(
         manifest["encoder"], manifest["encoder_hash"], manifest["image_size"], cameras,
-        config.robot_state_feature.shape[0], config.env_state_feature.shape[0],
+        config.robot_state_feature.shape[0], config.env_state_feature.shape[0] // 2,
     )  # fmt: skip
     step.load_state_dict(load_file(Path(seen) / AIM))
     elsewhere = {"device_processor": {"device": "cpu"}}

@@ -42,16 +42,18 @@ record bag_mix bag_mix 0 400
 record bag_branches bag_branches 0 150
 record bag_climbs bag_climbs 0
 record bag_lifts bag_lifts 0 100
+record bag_middle bag_middle 0
 record bag_strong bag_strong 0
 record bag_weak bag_weak 0
 record held_branches bag_branches 1 50
 record held_lifts bag_lifts 1 40
-# Careless demonstrations are of a bag that is sealed, and would tell the filter that nothing can fall out.
+# Not the policies' demonstrations: careless ones are of a bag that is sealed, and would tell the filter that nothing can
+# fall out; and they say what the operator wanted, not what the pushed hand did.
 [ -e "$DATA/bag" ] || $BIN/python - "$DATA" <<'EOF'
 import sys
 from pathlib import Path
 from lerobot.datasets.aggregate import aggregate_datasets
-data, parts = Path(sys.argv[1]), ["bag_mix", "bag_branches", "bag_climbs", "bag_lifts", "bag_strong"]
+data, parts = Path(sys.argv[1]), ["bag_mix", "bag_branches", "bag_climbs", "bag_lifts", "bag_middle"]
 aggregate_datasets([f"latentsafe/{p}" for p in parts], "latentsafe/bag", [data / p for p in parts], data / "bag.begun")
 (data / "bag.begun").rename(data / "bag")
 EOF

@@ -86,6 +86,29 @@ def test_branches_share_their_grasp_and_differ_after_it():
     assert np.abs(state(0, 0) - state(5, 0)).max() > 0.01
 
 
+def test_what_the_operator_of_a_pushed_hand_wants_is_recorded(tiny):
+    from dataclasses import replace
+
+    from lerobot_latentsafe.robots.franka_interface import action_limits
+    from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
+    from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
+
+    low, high = action_limits(20)
+    steady = SOURCES["tiny"]
+    with LatentSafeFrankaMujoco(LatentSafeFrankaMujocoConfig(scene="blocks", image_size=32)) as robot:
+        runs, poses = [], []
+        for source in (steady, replace(steady, pushed=0.1)):
+            frames = list(collect_franka.episode_frames(robot, source, 0, seed=3))
+            runs.append(np.stack([frame["action"] for frame in frames]))
+            poses.append(np.stack([frame["observation.state"][8:11] for frame in frames]))
+    pushed = runs[1]
+    assert ((pushed >= low - 1e-6) & (pushed <= high + 1e-6)).all()
+    assert np.abs(poses[1] - poses[0]).max() > 0.005  # the hand strays
+    # Recorded is not what the hand did.
+    moved = np.diff(poses[1], axis=0)
+    assert np.abs(moved - pushed[:-1, :3])[:20].max() > 0.002
+
+
 def test_mixes_keep_their_proportions():
     source = SOURCES["bag_mix"]
     assert source.n_episodes == 1300

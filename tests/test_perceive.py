@@ -41,7 +41,7 @@ def seeing(token_root, seen, tmp_path_factory):
 
     folder = tmp_path_factory.mktemp("seeing")
     features = {"observation.state": PolicyFeature(FeatureType.STATE, (2,))}
-    features[OBS_ENV_STATE] = PolicyFeature(FeatureType.ENV, (2,))
+    features[OBS_ENV_STATE] = PolicyFeature(FeatureType.ENV, (4,))
     config = tiny.diffusion_config(input_features=features)
     one = torch.ones(2)
     stats = {key: {"min": -one, "max": one} for key in ("observation.state", "action")}
@@ -85,7 +85,8 @@ def test_live_observation_is_seen_as_in_training(seeing, token_root, dataset_roo
     view = base.preprocessor(dict(batch))[OBS_ENV_STATE]
     aim = next(step.aim for step in base.preprocessor.steps if isinstance(step, PerceiveStep))
     percepts, state = FrameCache.open(token_root).frames(np.array([7]), ["tokens"])
-    torch.testing.assert_close(view, aim(percepts["tokens"], state), rtol=1e-2, atol=1e-2)  # the cache holds 16 bits
+    moves = aim(percepts["tokens"], state)
+    torch.testing.assert_close(view, aim.in_detail(moves), rtol=1e-2, atol=1e-2)  # the cache holds 16 bits
     assert base.propose(batch).shape == (1, 2)
 
 
@@ -95,7 +96,16 @@ def test_a_policy_learns_from_aims_of_a_network_that_did_not_learn_from_them(see
     aim = Aim(1, *percepts["tokens"].shape[1:], state.shape[1], n_moves=2)
     aim.load_state_dict(load_file(seen.root / perceive.AIM))
     column = torch.from_numpy(np.stack(dataset.hf_dataset.with_format("numpy")[OBS_ENV_STATE]))
-    assert not torch.isclose(column, perceive.foreseen(aim.eval(), percepts["tokens"], state), rtol=1e-2).all(1).any()
+    by_one_that_did = aim.in_detail(perceive.foreseen(aim.eval(), percepts["tokens"], state))
+    assert column.shape == by_one_that_did.shape
+    assert not torch.isclose(column, by_one_that_did, rtol=1e-2).all(1).any()
+
+
+def test_small_motions_are_told_apart_where_large_ones_saturate():
+    aim = Aim(1, 36, 4, state_dim=1, n_moves=1)  # its motions have a deviation of 1
+    shown = aim.in_detail(torch.tensor([[0.0], [0.1], [2.0], [3.0], [-3.0]]))
+    torch.testing.assert_close(shown[:, 0], torch.tensor([0.0, 0.1, 2.0, 3.0, -3.0]))
+    torch.testing.assert_close(shown[:, 1], torch.tensor([0.0, 0.4621, 1.0, 1.0, -1.0]), atol=1e-3, rtol=0)
 
 
 def test_commands_that_cannot_be_aimed_at_are_named(token_root, tmp_path):

@@ -18,7 +18,7 @@ import numpy as np
 
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE
 from lerobot_latentsafe.envs.scenes import SCENES
-from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, STATE_NAMES
+from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, STATE_NAMES, action_limits, read_action
 
 if TYPE_CHECKING:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -39,6 +39,9 @@ class Source:
         grasps: of those states, the shares in which the bag is held by its closed end, middle and open end.
         astray: share of episodes that start with the arm astray instead of at home: demonstrations that all go straight
             to the bag never show a policy how to correct itself.
+        pushed: standard deviation of the speed in m/s at which the hand is pushed now and then while its fingers are
+            open. Recorded is what the operator commands, so that a policy learns to correct and not to stray (DART,
+            Laskey et al. 2017).
     """
 
     scene: str
@@ -47,6 +50,7 @@ class Source:
     branches: int = 0
     grasps: tuple[float, float, float] = (0.6, 0.2, 0.2)
     astray: float = 0.0
+    pushed: float = 0.0
 
     @property
     def n_episodes(self) -> int:
@@ -63,8 +67,9 @@ SOURCES: dict[str, Source] = {
     "bag_branches": Source("bag", {"branch": 500}, branches=5),
     "bag_climbs": Source("bag", {"climb": 200}, branches=4, grasps=(0.5, 0.1, 0.4)),
     "bag_lifts": Source("bag", {"rise": 200}, branches=1, grasps=(0.5, 0.0, 0.5)),
-    "bag_strong": Source("bag", {"middle": 100}, astray=0.8),
-    "bag_weak": Source("bag", {"closed_end": 100}, variant="sealed", astray=0.8),
+    "bag_middle": Source("bag", {"middle": 100}, astray=0.8),
+    "bag_strong": Source("bag", {"middle": 240}, astray=0.8, pushed=0.1),
+    "bag_weak": Source("bag", {"closed_end": 240}, variant="sealed", astray=0.8, pushed=0.1),
     "blocks_demos": Source("blocks", {"pluck_careful": 120, "pluck_careless": 80}),
     "blocks_random": Source("blocks", {"random": 200}),
 }
@@ -180,12 +185,14 @@ def episode_frames(robot: "LatentSafeFrankaMujoco", source: Source, episode: int
     if rng.random() < source.astray:
         _go(robot, stray(scene, GRASPED[source.behavior(episode)], rng))
     operator = LatentSafeScripted(LatentSafeScriptedConfig(behavior=source.behavior(episode), seed=episode))
+    pushes = _pushes(source.pushed / info.fps, n_frames, rng)
     failed = False
     with operator:
-        for _ in range(n_frames):
+        for push in pushes:
             failed |= bool(scene.truth()["failure"])
             seen = robot.get_observation()
-            sent = robot.send_action(operator.get_action())
+            action = operator.get_action()
+            sent = _send_pushed(robot, action, push) if push.any() else robot.send_action(action)
             after = scene.truth()
             yield {
                 "observation.images.front": seen["front"],
@@ -199,6 +206,20 @@ def episode_frames(robot: "LatentSafeFrankaMujoco", source: Source, episode: int
                 "next.done": np.array([False]),
                 "task": scene.task,
             }
+
+
+def _pushes(sd: float, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Moves (n, 6) per step that are added to an operator's: half of the time none, each held for 3 to 10 steps."""
+    moves = rng.normal(0, sd, (n, 6)) * [1, 1, 0.5, 0, 0, 4] * rng.integers(2, size=(n, 1))
+    return np.repeat(moves, rng.integers(3, 11, n), axis=0)[:n]
+
+
+def _send_pushed(robot: "LatentSafeFrankaMujoco", action: dict[str, float], push: np.ndarray) -> dict[str, float]:
+    """Act, pushed by (6,) unless the fingers are closing. Returns the action, clipped into its limits."""
+    wanted = read_action(action, robot.scene.fps).delta
+    pushed = wanted + np.append(push, 0) * (wanted[6] > 0.5)
+    robot.send_action(dict(zip(ACTION_NAMES, np.clip(pushed, *action_limits(robot.scene.fps)).tolist())))
+    return dict(zip(ACTION_NAMES, wanted.tolist()))
 
 
 def _scene_seed(seed: int, start: int) -> int:
