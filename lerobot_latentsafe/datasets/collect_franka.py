@@ -39,9 +39,9 @@ class Source:
         grasps: of those states, the shares in which the bag is held by its closed end, middle and open end.
         astray: share of episodes that start with the arm astray instead of at home: demonstrations that all go straight
             to the bag never show a policy how to correct itself.
-        pushed: standard deviation of the speed in m/s at which the hand is pushed now and then while its fingers are
-            open. Recorded is what the operator commands, so that a policy learns to correct and not to stray (DART,
-            Laskey et al. 2017).
+        pushed: standard deviation of the speed in m/s at which the hand is pushed now and then, and its fingers are
+            closed, while the operator keeps them open. Recorded is what the operator commands, so that a policy learns
+            to correct and not to stray (DART, Laskey et al. 2017).
     """
 
     scene: str
@@ -209,15 +209,16 @@ def episode_frames(robot: "LatentSafeFrankaMujoco", source: Source, episode: int
 
 
 def _pushes(sd: float, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Moves (n, 6) per step that are added to an operator's: half of the time none, each held for 3 to 10 steps."""
+    """Actions (n, 7) that are added to an operator's, each for 3 to 10 steps: moves half of the time, fingers less."""
     moves = rng.normal(0, sd, (n, 6)) * [1, 1, 0.5, 0, 0, 4] * rng.integers(2, size=(n, 1))
-    return np.repeat(moves, rng.integers(3, 11, n), axis=0)[:n]
+    closes = (rng.random(n) < 0.15) & (sd > 0)
+    return np.repeat(np.column_stack([moves, np.where(closes, -1.0, 0.0)]), rng.integers(3, 11, n), axis=0)[:n]
 
 
 def _send_pushed(robot: "LatentSafeFrankaMujoco", action: dict[str, float], push: np.ndarray) -> dict[str, float]:
-    """Act, pushed by (6,) unless the fingers are closing. Returns the action, clipped into its limits."""
+    """Act, pushed by (7,) unless the fingers are to close. Returns the action, clipped into its limits."""
     wanted = read_action(action, robot.scene.fps).delta
-    pushed = wanted + np.append(push, 0) * (wanted[6] > 0.5)
+    pushed = wanted + push * (wanted[6] > 0.5)
     robot.send_action(dict(zip(ACTION_NAMES, np.clip(pushed, *action_limits(robot.scene.fps)).tolist())))
     return dict(zip(ACTION_NAMES, wanted.tolist()))
 
