@@ -120,6 +120,8 @@ def test_mixes_keep_their_proportions():
 def test_bad_requests_are_refused(tiny, tmp_path):
     with pytest.raises(ValueError, match=r"--source is 'jar'; expected one of bag_mix"):
         collect("jar", "me/x", tmp_path / "x", 1, 0)
+    with pytest.raises(ValueError, match="--workers is 0; expected at least 1"):
+        collect("tiny", "me/x", tmp_path / "x", 1, 0, workers=0)
     (tmp_path / "precious").write_text("data")
     with pytest.raises(FileExistsError, match="another --root"):
         collect("tiny", "me/x", tmp_path, 1, 0)

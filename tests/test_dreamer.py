@@ -51,6 +51,17 @@ def drive(policy, n=3):
     return torch.stack([policy.select_action(observation(seed=t)) for t in range(n)])
 
 
+# Acting
+
+
+def test_actions_that_are_drawn_far_out_of_range_are_executed_and_remembered_clipped(task_policy, monkeypatch):
+    monkeypatch.setattr(task_policy.actor, "sample", lambda features: torch.full((2, 7), 50.0))
+    task_policy.reset()
+    action = task_policy.act(observation(), explore=True)
+    torch.testing.assert_close(task_policy.executed, torch.ones(2, 7))
+    torch.testing.assert_close(action, task_policy.model.denormalise_action(torch.ones(2, 7)))
+
+
 # Training
 
 

@@ -102,7 +102,7 @@ def collect_franka(
         workers: processes that record.
 
     Raises:
-        ValueError: unknown source, or an unfinished recording of another source, seed or repo_id.
+        ValueError: unknown source, no workers, or an unfinished recording of another source, seed or repo_id.
         FileExistsError: root exists.
     """
     from lerobot.datasets.aggregate import aggregate_datasets
@@ -111,6 +111,8 @@ def collect_franka(
 
     if name not in SOURCES:
         raise ValueError(f"--source is {name!r}; expected one of {', '.join(SOURCES)}")
+    if workers < 1:
+        raise ValueError(f"--workers is {workers}; expected at least 1")
     source, root = SOURCES[name], Path(root)
     n_episodes = n_episodes or source.n_episodes
     if root.exists():
