@@ -90,6 +90,16 @@ def test_text_is_escaped():
     assert "<b>" not in report.heading("<b>") + report.table(["<b>"], [["<b>"]]) + report.chart({"<b>": np.ones(3)}, 10)
 
 
+def test_frames_of_a_video_stand_for_it_on_paper(tmp_path):
+    from lerobot.utils.io_utils import write_video
+
+    grey = [np.full((32, 48, 3), level, np.uint8) for level in range(0, 200, 20)]
+    write_video(str(tmp_path / "run.mp4"), grey, 5)
+    shown = report.video(tmp_path / "run.mp4", "a run")
+    assert re.findall(r"<figcaption>(.*?)</figcaption>", shown) == ["0.0 s", "0.6 s", "1.2 s", "1.8 s", "a run"]
+    assert len(set(re.findall(r'<img alt="" src="(.*?)"', shown))) == report.PRINTED
+
+
 def test_chart_leaves_gaps_and_shades_what_is_asked():
     svg = report.chart({"V": np.array([0.0, np.nan, 1.0])}, 10, np.array([False, True, True]), level=0.5)
     assert svg.count("<rect") == 2 and "nan" not in svg and "stroke-dasharray" in svg

@@ -20,9 +20,10 @@ svg text { font: 11px system-ui, sans-serif; fill: #555; }
 .strip .flagged img { border-color: #e8842c; } .strip figcaption { font-size: .75rem; }
 @media print {
   body { margin: 0; max-width: none; font-size: 11pt; } video { display: none; }
+  img { max-height: 10cm; }
   figure, table, .player { break-inside: avoid; } h2 { break-after: avoid; }
 }
-@media screen { .player .strip { display: none; } }
+@media screen { video ~ .strip { display: none; } }
 """
 
 SCRIPT = """
@@ -45,6 +46,8 @@ for (const player of document.querySelectorAll(".player")) {
 """
 WIDTH, LEFT, HEIGHT = 720, 70, 120
 """Size of a chart, and of the margin its numbers stand in."""
+PRINTED = 4
+"""Frames that stand for a video on paper."""
 COLOURS = ("#1f6fb4", "#888888", "#2a9d5c", "#b0428f")
 
 
@@ -69,9 +72,9 @@ def picture(path: Path, caption: str) -> str:
 
 
 def video(path: Path, caption: str) -> str:
-    """An mp4, embedded."""
+    """An mp4, embedded; on paper a few of its frames."""
     source = f"data:video/mp4;base64,{_encoded(path)}"
-    return _figure(f'<video controls loop muted autoplay src="{source}"></video>', caption)
+    return _figure(f'<video controls loop muted autoplay src="{source}"></video>{_frames(path)}', caption)
 
 
 def chart(
@@ -142,6 +145,22 @@ def strip(images: list[np.ndarray], captions: list[str], flagged: list[bool] | N
             f'<figure{mark}><img alt="" src="{source}"><figcaption>{html.escape(caption)}</figcaption></figure>'
         )
     return f"<div class=strip>{''.join(cells)}</div>"
+
+
+def _frames(path: Path) -> str:
+    import cv2
+
+    film = cv2.VideoCapture(str(path))
+    n, fps = int(film.get(cv2.CAP_PROP_FRAME_COUNT)), film.get(cv2.CAP_PROP_FPS)
+    images, captions = [], []
+    for index in np.linspace(0, n - 1, PRINTED).astype(int):
+        film.set(cv2.CAP_PROP_POS_FRAMES, int(index))
+        read, image = film.read()
+        if read:
+            images.append(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+            captions.append(f"{index / fps:.1f} s")
+    film.release()
+    return strip(images, captions)
 
 
 def _figure(content: str, caption: str) -> str:
