@@ -196,6 +196,15 @@ def test_a_lost_gripper_ends_the_episode(robot):
         robot.get_observation()
 
 
+def test_a_gripper_lost_between_actions_is_told_at_the_next(robot):
+    robot.send_action(STILL)
+    robot.driver.gripper_lost = True
+    wait_for(lambda: robot._stream.error is not None)  # the stream asked for the state, in which to hold
+    robot.driver.gripper_lost = False
+    with pytest.raises(GripperError, match="does not answer"):
+        robot.send_action(STILL)
+
+
 def test_an_error_in_the_middle_of_an_episode_keeps_the_recording(robot, tmp_path):
     """What lerobot-record does: frames until the driver fails, then finalize."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset

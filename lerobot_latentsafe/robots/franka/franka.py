@@ -11,7 +11,7 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 from scipy.spatial.transform import Rotation, Slerp
 
 from lerobot_latentsafe.robots.franka.config_franka import LatentSafeFrankaConfig
-from lerobot_latentsafe.robots.franka.driver import ArmState, FrankaDriver, FrankaError, FrankyDriver
+from lerobot_latentsafe.robots.franka.driver import ArmState, FrankaDriver, FrankaError, FrankyDriver, GripperError
 from lerobot_latentsafe.robots.franka_interface import (
     ACTION_NAMES,
     GRIPPER_NAME,
@@ -227,7 +227,7 @@ class _Stream(threading.Thread):
     def __init__(self, driver: FrankaDriver, state: ArmState, fps: int, watchdog: float):
         super().__init__(daemon=True, name="franka-stream")
         self.driver, self.period, self.watchdog = driver, 1 / fps, watchdog
-        self.error: FrankaError | None = None
+        self.error: FrankaError | GripperError | None = None
         self._lock, self._stopping = threading.Lock(), threading.Event()
         self._from = self._to = (state.position, state.rotation)
         self._since = time.monotonic()
@@ -257,7 +257,7 @@ class _Stream(threading.Thread):
                     pose = self._now()
                     self._watch()
                 self.driver.track(*pose)
-            except FrankaError as e:
+            except (FrankaError, GripperError) as e:  # raised again by whoever acts next
                 self.error = e
                 return
 
