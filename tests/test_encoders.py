@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from lerobot_latentsafe.world_models import encoders
-from lerobot_latentsafe.world_models.encoders import EncoderError, load_encoder
+from lerobot_latentsafe.world_models.encoders import EfficientNetLite0, EncoderError, load_encoder
+from lerobot_latentsafe.world_models.perception import Perception, PerceptionConfig
 
 
 @pytest.fixture(scope="module")
@@ -99,3 +100,17 @@ def test_unknown_encoder_is_a_clear_error(tmp_path):
     pytest.importorskip("transformers")
     with pytest.raises(EncoderError, match="neither in the cache nor"):
         load_encoder(str(tmp_path / "nowhere"))
+
+
+def test_the_same_live_frames_are_encoded_once(monkeypatch):
+    """A policy that sees by the encoder and the filter over it share what they saw."""
+    policy, shielding = (Perception(PerceptionConfig("efficientnet_lite0"), ["wrist", "front"], 32) for _ in range(2))
+    calls, forward = [], EfficientNetLite0.forward
+    monkeypatch.setattr(EfficientNetLite0, "forward", lambda self, images: calls.append(1) or forward(self, images))
+    images = {key: torch.rand(1, 3, 32, 32) for key in ("wrist", "front")}
+    first = policy.tokens(images)
+    again = shielding.tokens({key: image.clone() for key, image in images.items()})
+    assert len(calls) == 1 and torch.equal(first, again)
+    images["wrist"][0, 0, 0, 0] += 0.5  # a new picture in the same memory
+    changed = shielding.tokens(images)
+    assert len(calls) == 2 and not torch.equal(changed, first)

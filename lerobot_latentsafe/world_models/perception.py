@@ -2,12 +2,16 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from lerobot_latentsafe.datasets.frame_cache import BASIS, FOLDER, FrameCacheError
 from lerobot_latentsafe.world_models.encoders import PatchEncoder, load_encoder
+
+LIVE = 64
+"""So many pictures at most are of robots that act now, and are remembered until the next ones."""
 
 
 @dataclass
@@ -89,11 +93,15 @@ class Perception(nn.Module):
     The encoder's weights are not part of a checkpoint; its name and hash in the configuration are.
     """
 
+    _latest: ClassVar[dict[tuple, tuple[Tensor, Tensor]]] = {}
+    """Pictures encoded last and their tokens: a policy and the filter that shields it look at the same ones."""
+
     def __init__(self, config: PerceptionConfig, image_keys: list[str], image_size: int):
         super().__init__()
         self.image_keys, self.image_size = sorted(image_keys), image_size
         encoder = load_encoder(config.encoder, config.encoder_hash)
         config.encoder, config.encoder_hash = encoder.name, encoder.weights_hash()
+        self.encoder_hash = config.encoder_hash
         self._encoder = [encoder]  # in a list, so that its weights are not ours
         self.n_patches = (image_size // encoder.patch) ** 2
         self.token_dim = encoder.dim * len(self.image_keys)
@@ -106,9 +114,15 @@ class Perception(nn.Module):
     def tokens(self, images: dict[str, Tensor]) -> Tensor:
         """Camera key -> (B, 3, S, S) in [0, 1] to tokens (B, P, n_cameras x dim), a patch of each side by side."""
         together = torch.cat([images[key] for key in self.image_keys])
+        key = self.encoder_hash, len(self.image_keys), together.device
+        known, tokens = self._latest.get(key, (None, None))
+        if known is not None and torch.equal(known, together):
+            return tokens
         self._encoder[0] = self.encoder.to(together.device)
-        tokens = self.encoder(together).float()
-        return torch.cat(tokens.chunk(len(self.image_keys)), -1)
+        tokens = torch.cat(self.encoder(together).float().chunk(len(self.image_keys)), -1)
+        if len(together) <= LIVE:
+            self._latest[key] = together, tokens
+        return tokens
 
     def load_basis(self, cache: Path) -> None:
         """Principal components from a token cache."""
