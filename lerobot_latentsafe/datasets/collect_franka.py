@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
 
 EPISODES_A_PART = 50
+HIGH = 0.10
+"""Height of the hand below which the fingers may hold something, m."""
 
 
 @dataclass(frozen=True)
@@ -39,9 +41,9 @@ class Source:
         grasps: of those states, the shares in which the bag is held by its closed end, middle and open end.
         astray: share of episodes that start with the arm astray instead of at home: demonstrations that all go straight
             to the bag never show a policy how to correct itself.
-        pushed: standard deviation of the speed in m/s at which the hand is pushed now and then, and its fingers are
-            closed, while the operator keeps them open. Recorded is what the operator commands, so that a policy learns
-            to correct and not to stray (DART, Laskey et al. 2017).
+        pushed: standard deviation of the speed in m/s at which the hand is pushed now and then, and high up its fingers
+            are closed, while the operator keeps them open. Recorded is what the operator commands, so that a policy
+            learns to correct and not to stray (DART, Laskey et al. 2017).
     """
 
     scene: str
@@ -221,6 +223,8 @@ def _send_pushed(robot: "LatentSafeFrankaMujoco", action: dict[str, float], push
     """Act, pushed by (7,) unless the fingers are to close. Returns the action, clipped into its limits."""
     wanted = read_action(action, robot.scene.fps).delta
     pushed = wanted + push * (wanted[6] > 0.5)
+    if robot.scene.controller.position[2] < HIGH:  # fingers that have closed on something are to stay closed
+        pushed[6] = wanted[6]
     robot.send_action(dict(zip(ACTION_NAMES, np.clip(pushed, *action_limits(robot.scene.fps)).tolist())))
     return dict(zip(ACTION_NAMES, wanted.tolist()))
 
