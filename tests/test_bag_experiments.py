@@ -13,6 +13,7 @@ import torch
 from lerobot_latentsafe.envs.bag import BagScene
 from lerobot_latentsafe.evaluation import bag
 from lerobot_latentsafe.evaluation.demo import Demo
+from lerobot_latentsafe.evaluation.report import PRINTED
 from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, STATE_NAMES, action_limits
 
 STEPS, SEEDS = 4, [bag.FIRST_SEED, bag.FIRST_SEED + 1]
@@ -90,7 +91,7 @@ def test_policies_are_compared_operators_traced_and_the_demo_tells(script, filte
 
     script("demo_bag").report(tmp_path, "margin", 90.0)
     page, numbers = (tmp_path / "report.html").read_text(), json.loads((tmp_path / "metrics.json").read_text())
-    assert page.count("<video") == 1 and page.count("<img") == 3 and "0/2 = 0.0%" in page
+    assert page.count("<video") == 1 and page.count("<img") == 3 + PRINTED and "0/2 = 0.0%" in page
     assert numbers["the same, shielded"]["overridden_share"] == 1.0 and "1.5 minutes" in capsys.readouterr().out
     for file in (policies, tmp_path / "severity.png", *tmp_path.glob("videos/*.mp4")):  # without a policy
         file.unlink()

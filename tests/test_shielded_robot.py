@@ -189,8 +189,10 @@ def test_moves_between_episodes_are_filtered_unless_allowed(trained, caplog, ann
             assert robot.send_action(PUSH) != pytest.approx(PUSH)
 
 
-def test_a_loop_far_faster_than_the_filter_is_not_trusted(robot, caplog):
-    for _ in range(12):
+def test_a_loop_far_faster_than_the_filter_is_not_trusted(robot, caplog, monkeypatch):
+    began = time.perf_counter()
+    for step in range(12):
+        monkeypatch.setattr(time, "perf_counter", lambda step=step: began + step / 100)  # of a slow machine, too
         robot.get_observation()
         robot.send_action(STILL)
     assert last(robot).reason.item() == Reason.WRONG_RATE and "--fps=20" in caplog.text
