@@ -38,7 +38,7 @@ class Source:
         mix: behaviours of `teleoperators/scripted` with the number of episodes of each, in a dataset of full size;
             smaller ones keep the proportions. Episodes of different behaviours are interleaved.
         branches: episodes that start from each grasped state; 0 records whole episodes from the start.
-        grasps: of those states, the shares in which the bag is held by its closed end, middle and open end.
+        grasps: of those states, the shares in which the bag is held by each of its segments, from its closed end on.
         astray: share of episodes that start with the arm astray instead of at home: demonstrations that all go straight
             to the bag never show a policy how to correct itself.
         pushed: standard deviation of the speed in m/s at which the hand is pushed now and then, and high up its fingers
@@ -50,7 +50,7 @@ class Source:
     mix: dict[str, int]
     variant: str | None = None
     branches: int = 0
-    grasps: tuple[float, float, float] = (0.6, 0.2, 0.2)
+    grasps: tuple[float, ...] = (0.6, 0, 0, 0.2, 0, 0, 0.2)
     astray: float = 0.0
     pushed: float = 0.0
 
@@ -67,8 +67,9 @@ class Source:
 SOURCES: dict[str, Source] = {
     "bag_mix": Source("bag", {"random": 1000, "open_end": 75, "middle": 75, "closed_end": 100, "side_to_side": 50}),
     "bag_branches": Source("bag", {"branch": 500}, branches=5),
-    "bag_climbs": Source("bag", {"climb": 200}, branches=4, grasps=(0.5, 0.1, 0.4)),
-    "bag_lifts": Source("bag", {"rise": 200}, branches=1, grasps=(0.5, 0.0, 0.5)),
+    "bag_climbs": Source("bag", {"climb": 200}, branches=4, grasps=(0.5, 0, 0, 0.1, 0, 0, 0.4)),
+    "bag_lifts": Source("bag", {"rise": 200}, branches=1, grasps=(0.5, 0, 0, 0, 0, 0, 0.5)),
+    "bag_between": Source("bag", {"branch": 100, "climb": 100}, branches=4, grasps=(0, 0.4, 0.2, 0, 0.2, 0.2, 0)),
     "bag_middle": Source("bag", {"middle": 100}, astray=0.8),
     "bag_strong": Source("bag", {"middle": 240}, astray=0.8, pushed=0.1),
     "bag_weak": Source("bag", {"closed_end": 240}, variant="sealed", astray=0.8, pushed=0.1),
@@ -233,13 +234,12 @@ def _scene_seed(seed: int, start: int) -> int:
     return 1_000_000 * seed + start
 
 
-def _grasp(robot: "LatentSafeFrankaMujoco", seed: int, grasps: tuple[float, float, float]) -> int:
+def _grasp(robot: "LatentSafeFrankaMujoco", seed: int, grasps: tuple[float, ...]) -> int:
     """Close the fingers on the bag, unrecorded. Returns the steps taken."""
-    from lerobot_latentsafe.envs import bag
     from lerobot_latentsafe.teleoperators.scripted.behaviors import grasp
 
     rng = np.random.default_rng([7, seed])
-    segment = rng.choice([bag.TAIL, bag.MIDDLE, bag.MOUTH], p=grasps)
+    segment = rng.choice(len(grasps), p=grasps)
     return _go(robot, grasp(robot.scene, int(segment), rng))
 
 
