@@ -27,6 +27,8 @@ from tqdm import trange
 if TYPE_CHECKING:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+SWITCH = "gripper.pos"
+"""The command whose falling is aimed at."""
 AIM = "aim.safetensors"
 """The network, beside the dataset that it was learned on."""
 KEYPOINTS, HIDDEN, DROPOUT = 16, 128, 0.1
@@ -201,12 +203,17 @@ def two_valued(action: np.ndarray) -> dict[str, tuple[float, float]]:
     return {i: (float(found[0]), float(found[1])) for i, found in values.items() if len(found) == 2}
 
 
+def switched(command: np.ndarray) -> np.ndarray:
+    """Where a command (N,) is below the middle of its range, as of closed fingers: bool (N,)."""
+    return command < (command.min() + command.max()) / 2
+
+
 def until_switched(state: np.ndarray, command: np.ndarray, episode: np.ndarray) -> np.ndarray:
     """How a state (N, M) changes until a command (N,) next falls below the middle of its range: (N, M).
 
     Zero where it does not fall any more in the episode (N,) of a frame.
     """
-    closed = command < (command.min() + command.max()) / 2
+    closed = switched(command)
     falls = closed & np.append(True, ~closed[:-1]) & np.append(False, episode[1:] == episode[:-1])
     index = np.arange(len(state))
     at = np.minimum.accumulate(np.where(falls, index, len(state))[::-1])[::-1]  # the next fall of any episode
@@ -222,7 +229,7 @@ def foreseen(aim: Aim, tokens: Tensor, state: Tensor) -> Tensor:
 
 
 def with_aim(
-    cache_root: str | Path, repo_id: str, output_dir: str | Path, switch: str = "gripper.pos",
+    cache_root: str | Path, repo_id: str, output_dir: str | Path, switch: str = SWITCH,
     moved: Sequence[str] = ("ee_x.pos", "ee_y.pos", "ee_z.pos", "ee_rz.pos"), device: str = "cpu",
 ) -> "LeRobotDataset":  # fmt: skip
     """Copy a token-cached dataset with the aim of each frame as a column that policies read, and the network beside it.

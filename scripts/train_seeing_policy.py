@@ -30,7 +30,7 @@ from tqdm import trange
 
 from lerobot_latentsafe.datasets.frame_cache import FOLDER, MANIFEST
 from lerobot_latentsafe.datasets.windows import Windows
-from lerobot_latentsafe.perceive import AIM, let_see, with_aim
+from lerobot_latentsafe.perceive import AIM, SWITCH, let_see, switched, with_aim
 
 OPEN_FINGERS = 3
 """How much likelier a frame before the fingers close is drawn: what is hard is to get there."""
@@ -48,8 +48,8 @@ def train(config: TrainPipelineConfig, dataset: LeRobotDataset, output_dir: Path
     deltas = resolve_delta_timestamps(policy.config, dataset.meta)
     frames = {key: [round(t * dataset.fps) for t in times] for key, times in deltas.items()}
     windows = Windows(dataset, frames, policy.config.drop_n_last_frames)
-    command = windows.columns["action"][:, dataset.meta.features["action"]["names"].index("gripper.pos")]
-    still_open = windows.anchors[(command > (command.min() + command.max()) / 2).numpy()[windows.anchors]]
+    command = windows.columns["action"][:, dataset.meta.features["action"]["names"].index(SWITCH)].numpy()
+    still_open = windows.anchors[~switched(command)[windows.anchors]]
     windows.anchors = np.concatenate([windows.anchors, *[still_open] * (OPEN_FINGERS - 1)])
     last, begun = output_dir / "checkpoints" / "last", 0
     if last.exists():

@@ -196,8 +196,7 @@ def episode_frames(robot: "LatentSafeFrankaMujoco", source: Source, episode: int
         for push in pushes:
             failed |= bool(scene.truth()["failure"])
             seen = robot.get_observation()
-            action = operator.get_action()
-            sent = _send_pushed(robot, action, push) if push.any() else robot.send_action(action)
+            sent = _send_pushed(robot, operator.get_action(), push)
             after = scene.truth()
             yield {
                 "observation.images.front": seen["front"],

@@ -20,7 +20,7 @@ svg text { font: 11px system-ui, sans-serif; fill: #555; }
 .strip .flagged img { border-color: #e8842c; } .strip figcaption { font-size: .75rem; }
 @media print {
   body { margin: 0; max-width: none; font-size: 11pt; } video { display: none; }
-  img { max-height: 10cm; }
+  img { max-height: 10cm; } .strip img { max-height: none; }
   figure, table, .player { break-inside: avoid; } h2 { break-after: avoid; }
 }
 @media screen { video ~ .strip { display: none; } }
@@ -148,12 +148,13 @@ def strip(images: list[np.ndarray], captions: list[str], flagged: list[bool] | N
 
 
 def _frames(path: Path) -> str:
+    """A strip of frames from an mp4's beginning to its end."""
     import cv2
 
     film = cv2.VideoCapture(str(path))
     n, fps = int(film.get(cv2.CAP_PROP_FRAME_COUNT)), film.get(cv2.CAP_PROP_FPS)
     images, captions = [], []
-    for index in np.linspace(0, n - 1, PRINTED).astype(int):
+    for index in np.unique(np.linspace(0, n - 1, PRINTED).round().astype(int)):
         film.set(cv2.CAP_PROP_POS_FRAMES, int(index))
         read, image = film.read()
         if read:
