@@ -1,4 +1,4 @@
-"""The labelling page in a real browser: Debian's Chromium, driven by Playwright."""
+"""The labelling page, and a report, in a real browser: Debian's Chromium, driven by Playwright."""
 
 import contextlib
 import os
@@ -11,8 +11,12 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import tiny
+from lerobot.utils.io_utils import write_video
+
+from lerobot_latentsafe.evaluation import report
 
 pytest.importorskip("starlette", reason="needs the label extra")
 sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright (the dev extra)")
@@ -242,3 +246,18 @@ def test_labels_survive_a_kill_in_the_middle(filmed, browser, tmp_path):
             assert verdicts(second, "spilled") == [*lengths[:3], *[None] * 9]
     finally:
         second.kill()
+
+
+def test_a_report_shows_videos_on_screen_and_frames_on_paper(browser, tmp_path):
+    grey = [np.full((32, 48, 3), level, np.uint8) for level in range(0, 200, 20)]
+    write_video(str(tmp_path / "run.mp4"), grey, 5)
+    frames = report.strip(grey[:2], ["first", "second"])
+    parts = [report.video(tmp_path / "run.mp4", "a run"), report.player(tmp_path / "run.mp4", [], 2.0, "", frames)]
+    report.write_report(tmp_path / "report.html", "runs", parts)
+    page = browser.new_page()
+    page.goto(f"file://{tmp_path / 'report.html'}")
+    for medium, videos, strips in (("screen", True, False), ("print", False, True)):
+        page.emulate_media(media=medium)
+        for selector, shown in (("video", videos), (".strip", strips)):
+            assert [element.is_visible() for element in page.locator(selector).all()] == [shown, shown]
+    page.close()

@@ -19,9 +19,9 @@ svg text { font: 11px system-ui, sans-serif; fill: #555; }
 .strip img { width: 100%; border: 3px solid transparent; image-rendering: pixelated; display: block; }
 .strip .flagged img { border-color: #e8842c; } .strip figcaption { font-size: .75rem; }
 @media print {
-  body { margin: 0; max-width: none; font-size: 11pt; } video { display: none; }
+  body { margin: 0; max-width: none; font-size: 11pt; } video, .player video { display: none; }
   img { max-height: 10cm; } .strip img { max-height: none; }
-  figure, table, .player { break-inside: avoid; } h2 { break-after: avoid; }
+  figure, table, .player, .strip { break-inside: avoid; } h2, h3, p:has(+ .strip) { break-after: avoid; }
 }
 @media screen { video ~ .strip { display: none; } }
 """
