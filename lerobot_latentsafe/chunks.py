@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 if TYPE_CHECKING:
+    from lerobot.configs.policies import PreTrainedConfig
     from lerobot.policies.pretrained import PreTrainedPolicy
 
 
@@ -16,23 +17,24 @@ class ChunksAhead:
     """Plays the chunks of a LeRobot policy, and has the next one made in another thread before the present one ends.
 
     A chunk starts at the tick whose observation it was begun on: actions whose time is past when it is taken up are
-    left out. If it is not ready by then, the control thread waits for it.
+    left out, and as many later ones played for them, where the policy plans further than it plays. If it is not ready
+    by then, the control thread waits for it.
 
     Args:
         policy: one that plays its chunks from a queue of actions, such as LeRobot's diffusion policy or ACT.
         ahead: actions of a chunk that are still to come when the next one is begun.
 
     Raises:
-        ValueError: the policy makes no chunks, or too short ones.
+        ValueError: the policy makes no chunks, or plans too short ones.
     """
 
     def __init__(self, policy: "PreTrainedPolicy", ahead: int):
-        self.policy, self.ahead = policy, ahead
-        length = getattr(policy.config, "n_action_steps", 1)
-        if queued_actions(policy) is None or length < ahead + 2:
+        self.policy, self.ahead, self.played = policy, ahead, getattr(policy.config, "n_action_steps", 1)
+        planned = _planned(policy.config)
+        if queued_actions(policy) is None or planned < ahead + 2:
             raise ValueError(
-                f"--policy.base_ahead is {ahead}, but the base policy ({policy.config.type}) plays chunks of {length} "
-                f"actions; expected at most {max(length - 2, 0)} (0: chunks are made on the control thread)"
+                f"--policy.base_ahead is {ahead}, but the base policy ({policy.config.type}) plans {planned} actions; "
+                f"expected at most {max(planned - 2, 0)} (0: chunks are made on the control thread)"
             )
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="chunks")
         self.reset()
@@ -50,7 +52,7 @@ class ChunksAhead:
             if self._next is None:
                 self._begin()
             begun, self._next = self._next, None  # what went wrong is raised once
-            self._playing.extend(begun.result().unbind(1)[self._ticks :])
+            self._playing.extend(begun.result().unbind(1)[self._ticks : self._ticks + self.played])
         action = self._playing.popleft()
         if len(self._playing) <= self.ahead and self._next is None:
             self._begin()
@@ -76,7 +78,24 @@ class ChunksAhead:
         planner = copy.copy(self.policy)  # the same weights; what it saw until now, whatever is seen meanwhile
         if hasattr(self.policy, "_queues"):
             planner._queues = {key: deque(past, past.maxlen) for key, past in self.policy._queues.items()}
-        self._next = self._worker.submit(torch.no_grad()(planner.predict_action_chunk), self._batch)
+        self._next = self._worker.submit(self._plan, planner, self._batch)
+
+    @torch.no_grad()
+    def _plan(self, planner: "PreTrainedPolicy", batch: dict[str, Tensor]) -> Tensor:
+        """A chunk (B, N, A), as long as it is planned. While one is made, none is played from the policy's own queue."""
+        config = planner.config
+        config.n_action_steps = _planned(config)
+        try:
+            return planner.predict_action_chunk(batch)
+        finally:
+            config.n_action_steps = self.played
+
+
+def _planned(config: "PreTrainedConfig") -> int:
+    """How many actions from now on a policy plans, of which it plays the first `n_action_steps`."""
+    if hasattr(config, "horizon"):  # of a diffusion policy, counted from its first observation on
+        return config.horizon - config.n_obs_steps + 1
+    return getattr(config, "chunk_size", getattr(config, "n_action_steps", 1))
 
 
 def queued_actions(policy: "PreTrainedPolicy") -> deque | None:

@@ -16,8 +16,8 @@ STATE = "observation.state"
 class Clock:
     """Plans to do at each tick what the time will be then."""
 
-    def __init__(self, length=6):
-        self.config = SimpleNamespace(type="clock", n_action_steps=length)
+    def __init__(self, length=6, **further):
+        self.config = SimpleNamespace(type="clock", n_action_steps=length, **further)
         self.threads, self.planned = set(), []
         self.reset()
 
@@ -82,8 +82,18 @@ def test_what_goes_wrong_in_the_other_thread_is_raised_in_this_one():
     assert chunks.act(seen(1))[0].item() == 1  # once
 
 
-def test_chunks_must_be_long_enough():
-    with pytest.raises(ValueError, match=r"base_ahead is 5.*chunks of 6.*at most 4"):
+@pytest.mark.parametrize("further", [{"horizon": 8, "n_obs_steps": 2}, {"chunk_size": 7}], ids=["diffusion", "act"])
+def test_a_policy_that_plays_little_of_its_plan_plays_later_parts_of_it(further):
+    policy = Clock(2, **further)
+    chunks = ChunksAhead(policy, 1)
+    assert [chunks.act(seen(t))[0].item() for t in range(9)] == list(range(9))
+    chunks._next.result()
+    assert policy.planned == [0, 0, 2, 4, 6, 8], "a chunk is played for two ticks"
+    assert policy.config.n_action_steps == 2
+
+
+def test_plans_must_be_long_enough():
+    with pytest.raises(ValueError, match=r"base_ahead is 5.*plans 6 actions.*at most 4"):
         ChunksAhead(Clock(), 5)
 
 
