@@ -82,7 +82,7 @@ class ChunksAhead:
 
     @torch.no_grad()
     def _plan(self, planner: "PreTrainedPolicy", batch: dict[str, Tensor]) -> Tensor:
-        """A chunk (B, N, A), as long as it is planned. While one is made, none is played from the policy's own queue."""
+        """A chunk (B, N, A), as long as it is planned; meanwhile nobody plays from the policy's own queue."""
         config = planner.config
         config.n_action_steps = _planned(config)
         try:
