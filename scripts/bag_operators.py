@@ -63,7 +63,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--filters", nargs="+", required=True)
     parser.add_argument("--operators", nargs="+", choices=OPERATORS, default=list(OPERATORS))
-    parser.add_argument("--laws", nargs="+", choices=LAWS, default=["reachability", "plan", "margin"])
+    parser.add_argument(
+        "--laws", nargs="+", choices=LAWS, default=["reachability", "plan", "margin"],
+        help="the first for all filters, the others for the first filter",
+    )  # fmt: skip
     parser.add_argument("--n", type=int, default=100)
     parser.add_argument("--first_seed", type=int, default=FIRST_SEED, help="smaller ones are for choosing settings")
     parser.add_argument("--epsilon", type=float)

@@ -77,7 +77,10 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--weak", help="policy that learnt from careless demonstrations")
     parser.add_argument("--strong", help="policy that learnt from careful ones")
     parser.add_argument("--filters", nargs="+", required=True)
-    parser.add_argument("--laws", nargs="+", choices=LAWS, default=["reachability", "plan", "margin"])
+    parser.add_argument(
+        "--laws", nargs="+", choices=LAWS, default=["reachability", "plan", "margin"],
+        help="the first for all filters, the others for the first filter",
+    )  # fmt: skip
     parser.add_argument("--n", type=int, default=100)
     parser.add_argument("--epsilon", type=float)
     parser.add_argument("--guard", type=int)

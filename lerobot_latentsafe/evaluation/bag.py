@@ -50,8 +50,12 @@ class FilterSetting:
 
     @classmethod
     def all(cls, paths: list[str], laws: list[str], options: object) -> list["FilterSetting"]:
-        """Filters under laws, with the epsilon and guard of a command line's options."""
-        return [cls.of(path, law, options.epsilon, options.guard) for law in laws for path in paths]
+        """Filters under the first law, and the first of them under the others, which are what it is compared with.
+
+        Epsilon and guard are those of a command line's options.
+        """
+        pairs = [(path, laws[0]) for path in paths] + [(paths[0], law) for law in laws[1:]]
+        return [cls.of(path, law, options.epsilon, options.guard) for path, law in pairs]
 
     def load(self, base: str | None = None) -> LatentSafePolicy:
         """The filter, with the policy it is to shield, if any."""
