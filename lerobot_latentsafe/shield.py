@@ -50,6 +50,7 @@ class Shield:
         self.executed: Tensor | None = None
         self.decision: FilterDecision | None = None
         self.decided_at: float | None = None
+        self._told = False
 
     @torch.no_grad()
     def __call__(
@@ -95,7 +96,18 @@ class Shield:
         )
         self.latent, self.decision, self.decided_at = latent, decision, finished
         self.executed = model.normalise_action(decision.action).nan_to_num(0.0).clamp(-1, 1)
+        self._tell(decision)
         return decision
+
+    def _tell(self, decision: FilterDecision) -> None:
+        """Log the first override of an episode."""
+        if self._told or not decision.unsafe.any():
+            return
+        self._told = True
+        given = decision.reason[decision.unsafe].unique().tolist()
+        reasons = ", ".join(Reason(number).name.lower().replace("_", " ") for number in given)
+        acts = "acts" if decision.intervened.any() else "would act"
+        logger.info("the filter %s for the first time in this episode: %s", acts, reasons)
 
     def adopt(self, action: Tensor, within_s: float) -> bool:
         """Take over the decision, and the memory, of another shield of this process that just let this action through.

@@ -314,6 +314,18 @@ def test_monitor_mode_lets_everything_through_and_reports(strict):
     assert decision.reason.tolist() == [Reason.UNSAFE_VALUE, Reason.ACTION_OUT_OF_RANGE, Reason.UNSAFE_VALUE]
 
 
+@pytest.mark.parametrize(("mode", "does"), [("filter", "acts"), ("monitor", "would act")])
+def test_the_first_override_of_an_episode_is_logged(strict, caplog, mode, does):
+    strict.config.mode = mode
+    for _ in range(2):
+        strict.reset()
+        with caplog.at_level("INFO"):
+            for observation in along(3):
+                strict.shield(observation, actions(STRAIGHT))
+    said = f"the filter {does} for the first time in this episode: unsafe value"
+    assert [message for message in caplog.messages if "first time" in message] == [said] * 2
+
+
 def test_fallback_keeps_its_grip(cache_meta, tmp_path):
     """A kept command stays as it was last executed, whatever is proposed; the rest is the fallback's."""
     from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
