@@ -27,11 +27,15 @@ def seen_and_imagined(
 ) -> tuple[Tensor, Tensor]:
     """Features (N, D) and labels (N,) of random windows: a few frames are seen, the rest imagined as they were acted.
 
-    A margin that has seen real latents alone is a stranger to imagined ones, and those are what a filter asks about.
+    A margin that has seen real latents alone is a stranger to imagined ones, and those are what a filter asks about. A
+    quarter of the windows begin where episodes do, as whatever a filter sees does.
     """
     world_model, rows = policy.world_model, []
+    _, begins = np.unique(reader.labels.episode, return_index=True)
     for _ in range(-(-n_clips // 64)):
-        clip = reader.cut(torch.randint(len(reader.labels.failure), (64,), generator=generator).numpy(), policy)
+        first = torch.randint(len(reader.labels.failure), (64,), generator=generator).numpy()
+        first[:16] = begins[torch.randint(len(begins), (16,), generator=generator).numpy()]
+        clip = reader.cut(first, policy)
         observed = int(torch.randint(1, clip.state.shape[1] + 1, (), generator=generator))
         latent = None
         for t in range(clip.state.shape[1]):
