@@ -32,6 +32,9 @@ from lerobot_latentsafe.evaluation.rollouts import write_json
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.shield import BasePolicy
 
+STEPS = 150
+"""Policies take their time: one that learned to correct itself grasps after 4 to 9 s."""
+
 scene = cache(BagScene)
 
 
@@ -44,7 +47,7 @@ def actor(base: str, setting: FilterSetting | None) -> BasePolicy | LatentSafePo
 
 def job(base: str, setting: FilterSetting | None) -> dict:
     """All that a run depends on but its seed."""
-    return {"base": base, "base_fingerprint": fingerprint(base), "filter": as_job(setting)}
+    return {"steps": STEPS, "base": base, "base_fingerprint": fingerprint(base), "filter": as_job(setting)}
 
 
 def run(job: dict, frames: list[np.ndarray] | None = None) -> dict:
@@ -52,7 +55,7 @@ def run(job: dict, frames: list[np.ndarray] | None = None) -> dict:
     acting = actor(job["base"], FilterSetting(**job["filter"]) if job["filter"] else None)
     scene().reset(job["seed"])
     torch.manual_seed(job["seed"])  # a diffusion policy samples
-    return drive(scene(), acting, frames=frames)
+    return drive(scene(), acting, frames=frames, steps=STEPS)
 
 
 def film(name: str, bare: dict, shielded: dict, folder: Path) -> Path:

@@ -44,6 +44,8 @@ record bag_climbs bag_climbs 0
 record bag_lifts bag_lifts 0 100
 record bag_middle bag_middle 0
 record bag_between bag_between 0
+record bag_dither bag_dither 0
+record bag_clumsy bag_clumsy 0
 record bag_strong bag_strong 0
 record bag_weak bag_weak 0
 record held_branches bag_branches 1 50
@@ -54,7 +56,8 @@ record held_lifts bag_lifts 1 40
 import sys
 from pathlib import Path
 from lerobot.datasets.aggregate import aggregate_datasets
-data, parts = Path(sys.argv[1]), ["bag_mix", "bag_branches", "bag_climbs", "bag_lifts", "bag_middle", "bag_between"]
+data = Path(sys.argv[1])
+parts = [f"bag_{part}" for part in ("mix", "branches", "climbs", "lifts", "middle", "between", "dither", "clumsy")]
 aggregate_datasets([f"latentsafe/{p}" for p in parts], "latentsafe/bag", [data / p for p in parts], data / "bag.begun")
 (data / "bag.begun").rename(data / "bag")
 EOF

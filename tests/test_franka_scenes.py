@@ -8,6 +8,7 @@ from lerobot_latentsafe.envs import bag, franka
 from lerobot_latentsafe.envs.franka_env import BagEnv, BlocksEnv
 from lerobot_latentsafe.envs.scenes import SCENES, make_scene
 from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, HOME, STATE_NAMES, action_limits, read_action
+from lerobot_latentsafe.teleoperators.scripted import behaviors
 from lerobot_latentsafe.teleoperators.scripted.behaviors import begin
 
 
@@ -137,6 +138,29 @@ def test_closed_end_spills_and_open_end_does_not(bag_scene):
 def test_fast_swings_spill_and_slow_ones_do_not(bag_scene):
     assert [*play(bag_scene, "side_to_side", 1, 90, 0.3)][-1]["spilled"] > 0
     assert [*play(bag_scene, "side_to_side", 1, 90, 0.08)][-1]["spilled"] == 0
+
+
+def test_the_clumsy_grasp_off_centre_and_open_their_fingers_now_and_then(bag_scene):
+    def end(clumsiness):
+        bag_scene.reset(2)
+        *_, way = reach_of(behaviors.grasp(bag_scene, 3, np.random.default_rng(4), clumsiness=clumsiness), bag_scene)
+        return way
+
+    centre = end(0.0)
+    assert np.linalg.norm(end(1.0)[:2] - centre[:2]) < 0.005 < np.linalg.norm(end(3.0)[:2] - centre[:2]) < 0.03
+    closed = behaviors.hold(behaviors.CLOSED, 200)
+    actions = np.array([*behaviors.unsteady(bag_scene, closed, np.random.default_rng(0))])
+    assert 0.02 < (actions[:, 6] == behaviors.OPEN).mean() < 0.3
+    assert 0.001 < np.abs(actions[:, :3]).mean() < 0.01
+    low, high = action_limits(bag_scene.fps)
+    assert ((actions >= low) & (actions <= high)).all()
+
+
+def reach_of(actions, scene):
+    """Where the hand is after each action."""
+    for action in actions:
+        scene.step(action)
+        yield scene.controller.position.copy()
 
 
 def test_sealed_bag_does_not_spill():

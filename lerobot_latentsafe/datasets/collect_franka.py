@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE
-from lerobot_latentsafe.envs.scenes import SCENES
+from lerobot_latentsafe.envs.scenes import CLUMSINESS, HELD_ANYWHERE, SCENES
 from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, STATE_NAMES, action_limits, read_action
 
 if TYPE_CHECKING:
@@ -39,6 +39,7 @@ class Source:
             smaller ones keep the proportions. Episodes of different behaviours are interleaved.
         branches: episodes that start from each grasped state; 0 records whole episodes from the start.
         grasps: of those states, the shares in which the bag is held by each of its segments, from its closed end on.
+        clumsiness: of those grasps: 1 is off by a few millimetres.
         astray: share of episodes that start with the arm astray instead of at home: demonstrations that all go straight
             to the bag never show a policy how to correct itself.
         pushed: standard deviation of the speed in m/s at which the hand is pushed now and then, and high up its fingers
@@ -51,6 +52,7 @@ class Source:
     variant: str | None = None
     branches: int = 0
     grasps: tuple[float, ...] = (0.6, 0, 0, 0.2, 0, 0, 0.2)
+    clumsiness: float = 1.0
     astray: float = 0.0
     pushed: float = 0.0
 
@@ -70,6 +72,10 @@ SOURCES: dict[str, Source] = {
     "bag_climbs": Source("bag", {"climb": 200}, branches=4, grasps=(0.5, 0, 0, 0.1, 0, 0, 0.4)),
     "bag_lifts": Source("bag", {"rise": 200}, branches=1, grasps=(0.5, 0, 0, 0, 0, 0, 0.5)),
     "bag_between": Source("bag", {"branch": 100, "climb": 100}, branches=4, grasps=(0, 0.4, 0.2, 0, 0.2, 0.2, 0)),
+    "bag_dither": Source(
+        "bag", {"dither": 100, "branch": 60, "rise": 40}, branches=4, grasps=HELD_ANYWHERE, clumsiness=CLUMSINESS
+    ),
+    "bag_clumsy": Source("bag", {"clumsy": 120}),
     "bag_middle": Source("bag", {"middle": 100}, astray=0.8),
     "bag_strong": Source("bag", {"middle": 240}, astray=0.8, pushed=0.1),
     "bag_weak": Source("bag", {"closed_end": 240}, variant="sealed", astray=0.8, pushed=0.1),
@@ -185,7 +191,7 @@ def episode_frames(robot: "LatentSafeFrankaMujoco", source: Source, episode: int
     robot.reset(_scene_seed(seed, start))
     n_frames = round(info.episode_seconds * info.fps)
     if source.branches:
-        n_frames -= _grasp(robot, _scene_seed(seed, start), source.grasps)
+        n_frames -= _grasp(robot, _scene_seed(seed, start), source)
     rng = np.random.default_rng([8, _scene_seed(seed, start)])
     if rng.random() < source.astray:
         _go(robot, stray(scene, GRASPED[source.behavior(episode)], rng))
@@ -233,13 +239,13 @@ def _scene_seed(seed: int, start: int) -> int:
     return 1_000_000 * seed + start
 
 
-def _grasp(robot: "LatentSafeFrankaMujoco", seed: int, grasps: tuple[float, ...]) -> int:
+def _grasp(robot: "LatentSafeFrankaMujoco", seed: int, source: Source) -> int:
     """Close the fingers on the bag, unrecorded. Returns the steps taken."""
     from lerobot_latentsafe.teleoperators.scripted.behaviors import grasp
 
     rng = np.random.default_rng([7, seed])
-    segment = rng.choice(len(grasps), p=grasps)
-    return _go(robot, grasp(robot.scene, int(segment), rng))
+    segment = rng.choice(len(source.grasps), p=source.grasps)
+    return _go(robot, grasp(robot.scene, int(segment), rng, clumsiness=source.clumsiness))
 
 
 def _go(robot: "LatentSafeFrankaMujoco", actions: Iterator[np.ndarray]) -> int:

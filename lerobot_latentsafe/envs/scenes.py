@@ -30,6 +30,12 @@ SCENES: dict[str, SceneInfo] = {
 }  # fmt: skip
 
 
+CLUMSINESS = 3.0
+"""Of grasps of the bag that are only just such, as policies' are."""
+HELD_ANYWHERE = (0.4, 0.15, 0.05, 0.2, 0.05, 0.05, 0.1)
+"""How likely the clumsy hold the bag by each of its segments, from the closed end on."""
+
+
 def check_scene(name: str, variant: str | None, image_size: int | None) -> SceneInfo:
     """The scene's info.
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from lerobot_latentsafe.envs import bag, blocks
 from lerobot_latentsafe.envs.franka import FrankaScene
+from lerobot_latentsafe.envs.scenes import CLUMSINESS, HELD_ANYWHERE
 from lerobot_latentsafe.robots.franka_interface import MAX_SPEED, POINTING_DOWN, action_limits
 
 Actions = Iterator[np.ndarray]
@@ -58,13 +59,16 @@ GRASPED = {"open_end": bag.MOUTH, "middle": bag.MIDDLE, "closed_end": bag.TAIL}
 """Behaviour -> the segment that it lifts the bag by."""
 
 
-def grasp(scene: bag.BagScene, segment: int, rng: np.random.Generator, speed: float = MAX_SPEED) -> Actions:
-    """Close the fingers on a segment of the bag, approached at a speed in m/s."""
-    above = scene.segment_position(segment) + np.append(rng.normal(0, 0.003, 2), 0)
-    yaw = scene.yaw + rng.normal(0, 0.05)
+def grasp(
+    scene: bag.BagScene, segment: int, rng: np.random.Generator, speed: float = MAX_SPEED, clumsiness: float = 1.0
+) -> Actions:
+    """Close the fingers on a segment of the bag, approached at a speed in m/s; off by 3 mm times `clumsiness`."""
+    above = scene.segment_position(segment) + np.append(rng.normal(0, 0.003 * clumsiness, 2), 0)
+    yaw = scene.yaw + rng.normal(0, 0.05 * clumsiness)
+    low = 0.028 + (rng.uniform(0, 0.02) if clumsiness > 1 else 0.0)
     height = np.clip(scene.controller.position[2], 0.05, 0.12)  # a hand that is low already is put right down there
     yield from reach(scene, np.append(above[:2], height), speed, OPEN, yaw)
-    yield from reach(scene, np.append(above[:2], 0.028), speed, OPEN)
+    yield from reach(scene, np.append(above[:2], low), speed, OPEN)
     yield from hold(CLOSED, 9)
 
 
@@ -155,6 +159,29 @@ def climb(scene: bag.BagScene, speed: float, rng: np.random.Generator) -> Action
         height = min(0.28, height + rng.uniform(0.01, 0.04))
 
 
+def unsteady(scene: FrankaScene, actions: Actions, rng: np.random.Generator) -> Actions:
+    """As a policy does it that is not sure: moves are off by some millimetres, closed fingers open for a moment."""
+    low, high = action_limits(scene.fps)
+    off, opened = np.zeros(3), 0
+    for step, action in enumerate(actions):
+        if step % 2 == 0:  # such policies decide anew every other step
+            off = rng.normal(0, 0.004, 3) * (rng.random() < 0.7)
+            opened = opened - 1 if opened > 0 else int(rng.random() < 0.08) * int(rng.integers(1, 3))
+        gripper = OPEN if opened > 0 else action[6]
+        yield np.clip(np.array([*(action[:3] + off), *action[3:6], gripper]), low, high)
+
+
+def clumsy(scene: bag.BagScene, speed: float, rng: np.random.Generator) -> Actions:
+    """Grasp the bag somewhere, not well, and lift it."""
+    segment = int(rng.choice(bag.SEGMENTS, p=HELD_ANYWHERE))
+    approach = grasp(scene, segment, rng, rng.uniform(0.1, MAX_SPEED), CLUMSINESS)
+    yield from unsteady(scene, approach, rng)
+    while True:
+        start = scene.controller.position
+        yield from unsteady(scene, reach(scene, start + up(rng.uniform(0.05, 0.26)), speed, CLOSED), rng)
+        yield from hold(CLOSED, int(rng.exponential(6)))
+
+
 def rise(scene: bag.BagScene, speed: float) -> Actions:
     """From a grasped bag, the same lift always: what follows differs by where the bag is held alone."""
     yield from reach(scene, scene.controller.position + up(0.20), speed, CLOSED)
@@ -203,6 +230,8 @@ BAG: dict[str, tuple[Callable[..., Actions], tuple[float, float]]] = {
     "branch": (branch, (0.05, MAX_SPEED)),
     "climb": (climb, (0.10, MAX_SPEED)),
     "rise": (lambda scene, speed, rng: rise(scene, speed), (0.25, 0.25)),
+    "dither": (lambda scene, speed, rng: unsteady(scene, climb(scene, speed, rng), rng), (0.10, MAX_SPEED)),
+    "clumsy": (clumsy, (0.10, MAX_SPEED)),
     "random": (fumble, (0.2, MAX_SPEED)),
 }
 BLOCKS: dict[str, tuple[Callable[..., Actions], tuple[float, float]]] = {

@@ -11,6 +11,8 @@ BEHAVIORS = {
     "side_to_side": "hold the bag by its closed end and swing it; --teleop.speed decides what happens",
     "branch": "from a bag already grasped: lift, lift and lower, up and down, sideways, Gaussian, or hold",
     "climb": "from a bag already grasped: up in steps, with pauses and steps back",
+    "dither": "the same, as by a policy that is not sure: moves are off, closed fingers open for a moment",
+    "clumsy": "grasps the bag somewhere, not well, and lifts it like that",
     "rise": "from a bag already grasped: the same lift always",
     "random": "Gaussian actions, around the bag from a random grasp, around the blocks from above",
     "pluck_careful": "pull the green block straight up",
