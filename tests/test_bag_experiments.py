@@ -64,6 +64,7 @@ def script(monkeypatch):
         spec.loader.exec_module(module)
         module.BagScene = partial(BagScene, image_size=32)
         module.scene = cache(module.BagScene)
+        module.STEPS = STEPS
         monkeypatch.setattr(sys, "argv", [f"{name}.py", *options])
         return module
 

@@ -16,7 +16,8 @@ def size_of(name):
 
 
 def test_names_that_users_rely_on_are_committed():
-    assert {"dubins", "dubins_diffusion_reckless", "bag"} <= set(committed_names())
+    bag = {"bag", "bag_diffusion_weak", "bag_diffusion_strong"}
+    assert {"dubins", "dubins_diffusion_reckless", *bag} <= set(committed_names())
 
 
 def test_every_committed_checkpoint_loads():

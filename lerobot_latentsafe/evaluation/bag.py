@@ -22,6 +22,7 @@ from lerobot_latentsafe.shield import BasePolicy
 from lerobot_latentsafe.teleoperators.scripted.behaviors import Actions
 
 STEPS = 90
+"""Of an operator, who lifts the bag within 6 s."""
 FIRST_SEED = 300_000
 """Settings were chosen on smaller seeds."""
 WARM_UP = 3
@@ -89,7 +90,7 @@ def observe(scene: BagScene) -> dict[str, Tensor]:
 
 def drive(
     scene: BagScene, actor: BasePolicy | LatentSafePolicy | None, operator: Actions | None = None,
-    frames: list[np.ndarray] | None = None,
+    frames: list[np.ndarray] | None = None, steps: int | None = None,
 ) -> dict:  # fmt: skip
     """One episode of a scene that has just been reset.
 
@@ -97,6 +98,7 @@ def drive(
         actor: a bare policy; a filter, with a base policy or over an operator; None: the operator alone.
         operator: what an operator does, who goes on trying where the filter overrides; None: a policy acts.
         frames: the front camera's pictures of all steps are appended, if given.
+        steps: how long it lasts; by default an operator's.
 
     Returns:
         lost: candies outside at the end; success; grasped: whether the bag was ever held; overridden: steps; first:
@@ -106,7 +108,7 @@ def drive(
     action, decisions, cost, truths = np.zeros(7), [], [], []
     if actor is not None:
         actor.reset()
-    for _ in range(STEPS):
+    for _ in range(steps or STEPS):
         if frames is not None:
             frames.append(scene.render("front"))
         if operator is not None:
@@ -195,7 +197,7 @@ def summary(rows: list[dict], n_candies: int) -> dict:
     if any(row["value"] for row in rows):
         firsts = [row["first"] for row in rows if row["first"] is not None]
         result |= {
-            "overridden_share": float(np.mean([row["overridden"] for row in rows]) / STEPS),
+            "overridden_share": float(np.mean([row["overridden"] / len(row["spilled"]) for row in rows])),
             "episodes_overridden": len(firsts),
             "median_first_override": float(np.median(firsts)) if firsts else None,
         }
