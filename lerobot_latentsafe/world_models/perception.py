@@ -118,7 +118,8 @@ class Perception(nn.Module):
         known, tokens = self._latest.get(key, (None, None))
         if known is not None and torch.equal(known, together):
             return tokens
-        self._encoder[0] = self.encoder.to(together.device)
+        if self.encoder.mean.device != together.device:  # asking all of its modules at each tick takes milliseconds
+            self.encoder.to(together.device)
         tokens = torch.cat(self.encoder(together).float().chunk(len(self.image_keys)), -1)
         if len(together) <= LIVE:
             self._latest[key] = together, tokens
