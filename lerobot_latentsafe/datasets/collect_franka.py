@@ -73,7 +73,7 @@ SOURCES: dict[str, Source] = {
     "bag_lifts": Source("bag", {"rise": 200}, branches=1, grasps=(0.5, 0, 0, 0, 0, 0, 0.5)),
     "bag_between": Source("bag", {"branch": 100, "climb": 100}, branches=4, grasps=(0, 0.4, 0.2, 0, 0.2, 0.2, 0)),
     "bag_dither": Source(
-        "bag", {"dither": 100, "branch": 60, "rise": 40}, branches=4, grasps=HELD_ANYWHERE, clumsiness=CLUMSINESS
+        "bag", {"dither": 200, "branch": 100, "rise": 100}, branches=1, grasps=HELD_ANYWHERE, clumsiness=CLUMSINESS
     ),
     "bag_clumsy": Source("bag", {"clumsy": 120}),
     "bag_middle": Source("bag", {"middle": 100}, astray=0.8),
