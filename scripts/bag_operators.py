@@ -3,10 +3,10 @@
 
     scripts/bag_operators.py --filters <filter> ... --operators closed_end open_end --n=100
 
-Writes results/bag/operators.json: for each operator bare, and under each law and filter, the episodes that spill, the
-share of candies lost, steps overridden, the step of the first override, the CPU time of a decision, and of the first
-law and filter the values of a few episodes step by step; operators.png beside it draws those. Each run is kept in a
-.jsonl beside the output: a killed experiment goes on.
+Writes results/bag/operators.json: for each operator bare, under each filter, and under the laws that the first one is
+compared with, the episodes that spill, the share of candies lost, steps overridden, the step of the first override, the
+CPU time of a decision, and of the first law and filter the values of a few episodes step by step; operators.png beside
+it draws those. Each run is kept in a .jsonl beside the output: a killed experiment goes on.
 """
 
 import argparse
@@ -16,11 +16,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from lerobot_latentsafe.configuration_latentsafe import LAWS
 from lerobot_latentsafe.envs.bag import BagScene
 from lerobot_latentsafe.evaluation.bag import (
     FIRST_SEED,
     FilterSetting,
+    add_filter_options,
+    add_laws,
     as_job,
     drive,
     in_short,
@@ -61,17 +62,10 @@ def run(job: dict) -> dict:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--filters", nargs="+", required=True)
+    add_filter_options(parser, 100)
+    add_laws(parser)
     parser.add_argument("--operators", nargs="+", choices=OPERATORS, default=list(OPERATORS))
-    parser.add_argument(
-        "--laws", nargs="+", choices=LAWS, default=["reachability", "plan", "margin"],
-        help="the first for all filters, the others for the first filter",
-    )  # fmt: skip
-    parser.add_argument("--n", type=int, default=100)
     parser.add_argument("--first_seed", type=int, default=FIRST_SEED, help="smaller ones are for choosing settings")
-    parser.add_argument("--epsilon", type=float)
-    parser.add_argument("--guard", type=int)
-    parser.add_argument("--workers", type=int, default=1, help="processes")
     parser.add_argument("--output", type=Path, default=Path("results/bag/operators.json"))
     arguments = parser.parse_args()
     settings = FilterSetting.all(arguments.filters, arguments.laws, arguments)

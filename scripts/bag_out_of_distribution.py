@@ -21,6 +21,7 @@ from lerobot_latentsafe.configuration_latentsafe import LAWS
 from lerobot_latentsafe.envs.bag import VARIANTS, BagScene
 from lerobot_latentsafe.evaluation.bag import (
     FilterSetting,
+    add_filter_options,
     against_bare,
     as_job,
     drive,
@@ -71,12 +72,8 @@ def run(job: dict) -> dict:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--filters", nargs="+", required=True)
+    add_filter_options(parser, 50)
     parser.add_argument("--law", choices=LAWS, default=LAWS[0])
-    parser.add_argument("--n", type=int, default=50)
-    parser.add_argument("--epsilon", type=float)
-    parser.add_argument("--guard", type=int)
-    parser.add_argument("--workers", type=int, default=1, help="processes")
     parser.add_argument("--output", type=Path, default=Path("results/bag/out_of_distribution.json"))
     arguments = parser.parse_args()
     settings = FilterSetting.all(arguments.filters, [arguments.law], arguments)

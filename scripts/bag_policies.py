@@ -3,9 +3,10 @@
 
     scripts/bag_policies.py --weak=bag_diffusion_weak --strong=bag_diffusion_strong --filters <filter> ... --n=100
 
-Writes results/bag/policies.json: for each policy bare, and under each law and filter, runs that spill, candies lost,
-success, steps overridden, step of the first override, CPU time of a decision; and severity.png beside it, how many runs
-spill at least p% of the candies. Each run is kept in a .jsonl beside the output: a killed experiment goes on.
+Writes results/bag/policies.json: for each policy bare, under each filter, and under the laws that the first filter is
+compared with, runs that spill, candies lost, success, steps overridden, step of the first override, CPU time of a
+decision; and severity.png beside it, how many runs spill at least p% of the candies. Each run is kept in a .jsonl
+beside the output: a killed experiment goes on.
 """
 
 import argparse
@@ -15,11 +16,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from lerobot_latentsafe.configuration_latentsafe import LAWS
 from lerobot_latentsafe.envs.bag import BagScene
 from lerobot_latentsafe.evaluation.bag import (
     FIRST_SEED,
     FilterSetting,
+    add_filter_options,
+    add_laws,
     as_job,
     drive,
     fingerprint,
@@ -79,15 +81,8 @@ def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--weak", help="policy that learnt from careless demonstrations")
     parser.add_argument("--strong", help="policy that learnt from careful ones")
-    parser.add_argument("--filters", nargs="+", required=True)
-    parser.add_argument(
-        "--laws", nargs="+", choices=LAWS, default=["reachability", "plan", "margin"],
-        help="the first for all filters, the others for the first filter",
-    )  # fmt: skip
-    parser.add_argument("--n", type=int, default=100)
-    parser.add_argument("--epsilon", type=float)
-    parser.add_argument("--guard", type=int)
-    parser.add_argument("--workers", type=int, default=1, help="processes")
+    add_filter_options(parser, 100)
+    add_laws(parser)
     parser.add_argument(
         "--n_videos", type=int, default=0, help="starts to film, bare and under the first law and filter"
     )

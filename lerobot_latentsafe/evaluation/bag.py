@@ -2,6 +2,7 @@
 
 import hashlib
 import time
+from argparse import ArgumentParser
 from collections.abc import Callable, Hashable
 from dataclasses import asdict, dataclass
 from functools import cache
@@ -13,6 +14,7 @@ import torch
 from torch import Tensor
 
 from lerobot_latentsafe.checkpoint import WEIGHTS, read_config, resolve_checkpoint
+from lerobot_latentsafe.configuration_latentsafe import LAWS
 from lerobot_latentsafe.envs.bag import BagScene
 from lerobot_latentsafe.envs.franka import CAMERAS
 from lerobot_latentsafe.evaluation.rollouts import paired_p_value, provenance, run_resumable, wilson
@@ -65,6 +67,23 @@ class FilterSetting:
         if base is not None:
             policy.attach(base)
         return policy
+
+
+def add_filter_options(parser: ArgumentParser, n: int) -> None:
+    """The filters of an experiment, how they decide, and how many starts: by default n."""
+    parser.add_argument("--filters", nargs="+", required=True)
+    parser.add_argument("--n", type=int, default=n)
+    parser.add_argument("--epsilon", type=float)
+    parser.add_argument("--guard", type=int)
+    parser.add_argument("--workers", type=int, default=1, help="processes")
+
+
+def add_laws(parser: ArgumentParser) -> None:
+    """The laws that are compared, see `FilterSetting.all`."""
+    parser.add_argument(
+        "--laws", nargs="+", choices=LAWS, default=["reachability", "plan", "margin"],
+        help="the first for all filters, the others for the first filter",
+    )  # fmt: skip
 
 
 def as_job(setting: FilterSetting | None) -> dict | None:
