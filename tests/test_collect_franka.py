@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_latentsafe.datasets import collect_franka
@@ -107,6 +108,48 @@ def test_what_the_operator_of_a_pushed_hand_wants_is_recorded(tiny):
     # Recorded is not what the hand did.
     moved = np.diff(poses[1], axis=0)
     assert np.abs(moved - pushed[:-1, :3])[:20].max() > 0.002
+
+
+class Closes:
+    """A policy that closes the fingers at its third step and then moves up and sideways."""
+
+    def __init__(self, path, device):
+        self.executed = []
+
+    def reset(self):
+        self.steps = 0
+
+    def propose(self, batch):
+        assert batch["observation.images.front"].max() <= 1 and batch["observation.state"].shape == (1, 14)
+        self.steps += 1
+        return torch.tensor([[0.001, 0, 0.9, 0, 0, 0, float(self.steps < 3)]])  # more than the limits allow
+
+    def replan(self, executed):
+        self.executed.append(executed[0, :7].numpy())
+
+
+def test_a_policy_is_recorded_as_it_acts_and_is_overridden(tiny, monkeypatch):
+    from lerobot_latentsafe.datasets import policy_operator
+    from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
+    from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
+
+    monkeypatch.setattr(policy_operator, "BasePolicy", Closes)
+    collect_franka._policy_operator.cache_clear()
+    source = Source("blocks", {"closes": 2}, policies=True, seconds=3.0)
+    with LatentSafeFrankaMujoco(LatentSafeFrankaMujocoConfig(scene="blocks", image_size=32)) as robot:
+        runs = [list(collect_franka.episode_frames(robot, source, episode, 0)) for episode in (0, 0, 1)]
+    operator = collect_franka._policy_operator("closes", 20)
+    collect_franka._policy_operator.cache_clear()
+    actions = np.stack([[frame["action"] for frame in frames] for frames in runs])
+    assert actions.shape == (3, 60, 7)
+    np.testing.assert_array_equal(actions[0], actions[1])
+    assert np.abs(actions[0] - actions[2]).max() > 0
+    acts, overridden = actions[..., 0] > 0, actions[..., 0] == 0
+    assert (acts | overridden).all() and acts[:, :3].all() and overridden.any() and acts[:, 3:].any()
+    assert actions[acts][:, 2] == pytest.approx(0.3 / 20)
+    assert (actions[overridden][:, 2] <= 0).all() and (actions[overridden][:, 6] == 0).all()
+    # What was done instead is told to the policy, step by step.
+    np.testing.assert_array_equal(np.stack(operator.policy.executed), actions[overridden])
 
 
 def test_mixes_keep_their_proportions():

@@ -6,10 +6,10 @@ broken dataset. Episode i depends on the seed and i only.
 """
 
 import shutil
-from collections.abc import Iterator
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,11 +23,14 @@ from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, STATE_NAMES
 if TYPE_CHECKING:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+    from lerobot_latentsafe.datasets.policy_operator import PolicyOperator
     from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
 
 EPISODES_A_PART = 50
 HIGH = 0.10
 """Height of the hand below which the fingers may hold something, m."""
+OVERRIDDEN = 0.06
+"""Chance that a policy whose fingers are closed is overridden from a step on."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,8 @@ class Source:
         pushed: standard deviation of the speed in m/s at which the hand is pushed now and then, and high up its fingers
             are closed, while the operator keeps them open. Recorded is what the operator commands, so that a policy
             learns to correct and not to stray (DART, Laskey et al. 2017).
+        policies: the behaviours are names of policies, which are overridden now and then; see `policy_operator.py`.
+        seconds: how long an episode lasts; None: as long as the scene's.
     """
 
     scene: str
@@ -55,6 +60,8 @@ class Source:
     clumsiness: float = 1.0
     astray: float = 0.0
     pushed: float = 0.0
+    policies: bool = False
+    seconds: float | None = None
 
     @property
     def n_episodes(self) -> int:
@@ -76,6 +83,7 @@ SOURCES: dict[str, Source] = {
         "bag", {"dither": 200, "branch": 100, "rise": 100}, branches=1, grasps=HELD_ANYWHERE, clumsiness=CLUMSINESS
     ),
     "bag_clumsy": Source("bag", {"clumsy": 120}),
+    "bag_policies": Source("bag", {"bag_diffusion_weak": 150, "bag_diffusion_strong": 50}, policies=True, seconds=10.0),
     "bag_middle": Source("bag", {"middle": 100}, astray=0.8),
     "bag_strong": Source("bag", {"middle": 240}, astray=0.8, pushed=0.1),
     "bag_weak": Source("bag", {"closed_end": 240}, variant="sealed", astray=0.8, pushed=0.1),
@@ -183,26 +191,23 @@ def _record_part(source: Source, repo_id: str, parts: Path, episodes: range, see
 def episode_frames(robot: "LatentSafeFrankaMujoco", source: Source, episode: int, seed: int) -> Iterator[dict]:
     """The frames of an episode as `LeRobotDataset.add_frame` takes them; the first failing frame and all after fail."""
     from lerobot_latentsafe.teleoperators.scripted.behaviors import GRASPED, stray
-    from lerobot_latentsafe.teleoperators.scripted.config_scripted import LatentSafeScriptedConfig
-    from lerobot_latentsafe.teleoperators.scripted.scripted import LatentSafeScripted
 
     info, scene = SCENES[source.scene], robot.scene
     start = episode // source.branches if source.branches else episode
     robot.reset(_scene_seed(seed, start))
-    n_frames = round(info.episode_seconds * info.fps)
+    n_frames = round((source.seconds or info.episode_seconds) * info.fps)
     if source.branches:
         n_frames -= _grasp(robot, _scene_seed(seed, start), source)
     rng = np.random.default_rng([8, _scene_seed(seed, start)])
     if rng.random() < source.astray:
         _go(robot, stray(scene, GRASPED[source.behavior(episode)], rng))
-    operator = LatentSafeScripted(LatentSafeScriptedConfig(behavior=source.behavior(episode), seed=episode))
     pushes = _pushes(source.pushed / info.fps, n_frames, rng)
     failed = False
-    with operator:
+    with _operator(robot, source, episode) as act:
         for push in pushes:
             failed |= bool(scene.truth()["failure"])
             seen = robot.get_observation()
-            sent = _send_pushed(robot, operator.get_action(), push)
+            sent = _send_pushed(robot, act(seen), push)
             after = scene.truth()
             yield {
                 "observation.images.front": seen["front"],
@@ -216,6 +221,31 @@ def episode_frames(robot: "LatentSafeFrankaMujoco", source: Source, episode: int
                 "next.done": np.array([False]),
                 "task": scene.task,
             }
+
+
+@contextmanager
+def _operator(
+    robot: "LatentSafeFrankaMujoco", source: Source, episode: int
+) -> Iterator[Callable[[dict], dict[str, float]]]:
+    """Who moves the robot in an episode: observation -> action, clipped into its limits."""
+    from lerobot_latentsafe.teleoperators.scripted.config_scripted import LatentSafeScriptedConfig
+    from lerobot_latentsafe.teleoperators.scripted.scripted import LatentSafeScripted
+
+    behavior = source.behavior(episode)
+    if source.policies:
+        operator = _policy_operator(behavior, robot.scene.fps)
+        operator.begin(robot.scene.seed)
+        yield operator.act
+        return
+    with LatentSafeScripted(LatentSafeScriptedConfig(behavior=behavior, seed=episode)) as scripted:
+        yield lambda seen: scripted.get_action()
+
+
+@cache
+def _policy_operator(path: str, fps: int) -> "PolicyOperator":
+    from lerobot_latentsafe.datasets.policy_operator import PolicyOperator
+
+    return PolicyOperator(path, fps, OVERRIDDEN)
 
 
 def _pushes(sd: float, n: int, rng: np.random.Generator) -> np.ndarray:

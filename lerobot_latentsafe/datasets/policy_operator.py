@@ -1,0 +1,59 @@
+"""A policy as the operator of a recording: what a filter is to judge is best seen while that acts."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+
+from lerobot_latentsafe.envs.franka import CAMERAS
+from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, STATE_NAMES, action_limits
+from lerobot_latentsafe.shield import BasePolicy
+
+CLOSING = 0.5
+"""Command of the fingers below which they are to hold something."""
+
+
+class PolicyOperator:
+    """Acts as a policy does; while the fingers close, it is now and then overridden by hold or by the way down.
+
+    Filters override like that, and what a policy does next it does in no other recording.
+
+    Args:
+        path: of the policy; folder, Hub id or committed name.
+        fps: of the robot.
+        overridden: chance that an override begins at a step.
+    """
+
+    def __init__(self, path: str, fps: int, overridden: float):
+        self.policy, self.overridden = BasePolicy(path, "cpu"), overridden
+        self.limits = action_limits(fps)
+
+    def begin(self, seed: int) -> None:
+        """Start an episode; what follows depends on the seed and on what is seen."""
+        torch.manual_seed(seed)
+        self.policy.reset()
+        self.rng, self.left, self.override = np.random.default_rng([9, seed]), 0, np.zeros(6)
+        self.gripper = 1.0
+
+    def act(self, seen: Mapping[str, Any]) -> dict[str, float]:
+        """The action for an observation of a LeRobot robot, clipped into its limits."""
+        images = {name: torch.from_numpy(seen[name].copy()).permute(2, 0, 1)[None] / 255 for name in CAMERAS}
+        batch = {f"observation.images.{name}": image for name, image in images.items()}
+        batch["observation.state"] = torch.tensor([[seen[name] for name in STATE_NAMES]], dtype=torch.float32)
+        with torch.no_grad():
+            action = np.clip(self.policy.propose(batch)[0].double().numpy(), *self.limits)
+        if self._interrupts():
+            action = np.append(self.override, self.gripper)
+            self.policy.replan(torch.from_numpy(action).float()[None])
+        self.gripper = action[6]
+        return dict(zip(ACTION_NAMES, action.tolist()))
+
+    def _interrupts(self) -> bool:
+        """Whether this step is an override's; one lasts 2 to 12 steps."""
+        if self.left == 0 and self.gripper < CLOSING and self.rng.random() < self.overridden:
+            self.left = int(self.rng.integers(2, 13))
+            down = self.rng.random() < 0.6
+            self.override = np.array([0, 0, down * self.rng.uniform(0.2, 1) * self.limits[0][2], 0, 0, 0])
+        self.left = max(0, self.left - 1)
+        return self.left > 0
