@@ -67,8 +67,9 @@ class Collect:
     Sources of the Franka: bag_mix (the paper's 1,300 trajectories), bag_branches (several from each grasped state),
     bag_climbs (up in steps and pauses, as under a filter), bag_lifts (one and the same lift by either end),
     bag_between (branches and climbs, grasped between ends and middle), bag_dither and bag_clumsy (grasped badly and
-    lifted by unsteady fingers, as by a policy that errs), bag_middle, bag_strong and bag_weak (demonstrations whose
-    hand is pushed aside while the operator is recorded), blocks_demos, blocks_random.
+    lifted by unsteady fingers, as by a policy that errs), bag_policies (the committed diffusion policies act and are
+    overridden now and then), bag_middle, bag_strong and bag_weak (demonstrations whose hand is pushed aside while the
+    operator is recorded), blocks_demos, blocks_random.
     A killed recording of the Franka goes on if started again.
     """
 
@@ -78,6 +79,7 @@ class Collect:
     n_episodes: int | None = None
     """None: 2,000 of the car, and as many of the Franka as the source says."""
     seed: int = 0
+    """At one seed all sources start from the same scenes: where variety counts, give each its own."""
     workers: int = 1
     """Processes that record the Franka."""
 

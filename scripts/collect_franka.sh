@@ -5,7 +5,9 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 OUT=${1:-data}
 export HF_HUB_OFFLINE=1 OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
-for source in bag_mix bag_branches bag_climbs bag_lifts bag_between bag_dither bag_clumsy bag_policies bag_middle bag_strong bag_weak blocks_demos blocks_random; do
+for source in bag_mix bag_branches bag_climbs bag_lifts bag_between bag_dither bag_clumsy bag_middle bag_strong bag_weak blocks_demos blocks_random; do
   [ -e "$OUT/$source" ] && continue
   .venv/bin/latentsafe collect --source="$source" --repo_id="latentsafe/$source" --root="$OUT/$source"
 done
+[ -e "$OUT/bag_policies" ] || .venv/bin/latentsafe collect --source=bag_policies --repo_id=latentsafe/bag_policies \
+  --root="$OUT/bag_policies" --seed=23 --n_episodes=175
