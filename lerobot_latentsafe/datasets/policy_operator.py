@@ -50,7 +50,7 @@ class PolicyOperator:
         return dict(zip(ACTION_NAMES, action.tolist()))
 
     def _interrupts(self) -> bool:
-        """Whether this step is an override's; one lasts 2 to 12 steps."""
+        """Whether this step is an override's; one lasts 1 to 11 steps."""
         if self.left == 0 and self.gripper < CLOSING and self.rng.random() < self.overridden:
             self.left = int(self.rng.integers(2, 13))
             down = self.rng.random() < 0.6
