@@ -59,7 +59,8 @@ import sys
 from pathlib import Path
 from lerobot.datasets.aggregate import aggregate_datasets
 data = Path(sys.argv[1])
-parts = [f"bag_{part}" for part in ("mix", "branches", "climbs", "lifts", "middle", "between", "dither", "clumsy", "dither_more", "policies")]
+names = "mix branches climbs lifts middle between dither clumsy dither_more policies"
+parts = [f"bag_{name}" for name in names.split()]
 aggregate_datasets([f"latentsafe/{p}" for p in parts], "latentsafe/bag", [data / p for p in parts], data / "bag.begun")
 (data / "bag.begun").rename(data / "bag")
 EOF
@@ -81,7 +82,7 @@ for kind in weak strong; do
 done
 
 # The experiments: 6 CPU-seconds an episode of an operator, 11 to 17 of a policy, which is longer. Committed weights have
-# names; bag is a final_0 that learned from less, see README.
+# names; bag is a final_0.
 filters=$(for seed in $SEEDS; do echo "$OUT/final_$seed"; done)
 $BIN/python scripts/bag_operators.py --filters $filters --operators closed_end open_end --workers=2
 $BIN/python scripts/bag_policies.py --weak="$OUT/diffusion_weak" --strong="$OUT/diffusion_strong" --filters $filters \

@@ -5,11 +5,19 @@ from typing import Any
 
 import numpy as np
 import torch
+from lerobot.policies.utils import prepare_observation_for_inference
+from lerobot.utils.constants import OBS_IMAGES, OBS_STATE, OBS_STR
+from lerobot.utils.feature_utils import build_dataset_frame
 
 from lerobot_latentsafe.envs.franka import CAMERAS
 from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, STATE_NAMES, action_limits
 from lerobot_latentsafe.shield import BasePolicy
 
+OBSERVED = {
+    OBS_STATE: {"dtype": "float32", "shape": (len(STATE_NAMES),), "names": STATE_NAMES},
+    **{f"{OBS_IMAGES}.{name}": {"dtype": "image"} for name in CAMERAS},
+}
+"""What a policy is given of an observation."""
 CLOSING = 0.5
 """Command of the fingers below which they are to hold something."""
 
@@ -38,9 +46,7 @@ class PolicyOperator:
 
     def act(self, seen: Mapping[str, Any]) -> dict[str, float]:
         """The action for an observation of a LeRobot robot, clipped into its limits."""
-        images = {name: torch.from_numpy(seen[name].copy()).permute(2, 0, 1)[None] / 255 for name in CAMERAS}
-        batch = {f"observation.images.{name}": image for name, image in images.items()}
-        batch["observation.state"] = torch.tensor([[seen[name] for name in STATE_NAMES]], dtype=torch.float32)
+        batch = prepare_observation_for_inference(build_dataset_frame(OBSERVED, seen, OBS_STR), torch.device("cpu"))
         with torch.no_grad():
             action = np.clip(self.policy.propose(batch)[0].double().numpy(), *self.limits)
         if self._interrupts():
