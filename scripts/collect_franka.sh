@@ -9,5 +9,8 @@ for source in bag_mix bag_branches bag_climbs bag_lifts bag_between bag_dither b
   [ -e "$OUT/$source" ] && continue
   .venv/bin/latentsafe collect --source="$source" --repo_id="latentsafe/$source" --root="$OUT/$source"
 done
+# Of bags that no other source shows: all sources of one seed start from the same.
 [ -e "$OUT/bag_policies" ] || .venv/bin/latentsafe collect --source=bag_policies --repo_id=latentsafe/bag_policies \
   --root="$OUT/bag_policies" --seed=23 --n_episodes=175
+[ -e "$OUT/bag_pulls" ] || .venv/bin/latentsafe collect --source=bag_pulls --repo_id=latentsafe/bag_pulls \
+  --root="$OUT/bag_pulls" --seed=25

@@ -48,6 +48,8 @@ record bag_dither bag_dither 0
 record bag_dither_more bag_dither 21 # a seed of its own: bags of all sources lie alike at the same seed
 record bag_clumsy bag_clumsy 0
 record bag_policies bag_policies 23 175
+record bag_lifts_more bag_lifts 22
+record bag_pulls bag_pulls 25
 record bag_strong bag_strong 0
 record bag_weak bag_weak 0
 record held_branches bag_branches 1 50
@@ -59,7 +61,7 @@ import sys
 from pathlib import Path
 from lerobot.datasets.aggregate import aggregate_datasets
 data = Path(sys.argv[1])
-names = "mix branches climbs lifts middle between dither clumsy dither_more policies"
+names = "mix branches climbs lifts middle between dither clumsy dither_more policies lifts_more pulls"
 parts = [f"bag_{name}" for name in names.split()]
 aggregate_datasets([f"latentsafe/{p}" for p in parts], "latentsafe/bag", [data / p for p in parts], data / "bag.begun")
 (data / "bag.begun").rename(data / "bag")

@@ -84,6 +84,7 @@ SOURCES: dict[str, Source] = {
     ),
     "bag_clumsy": Source("bag", {"clumsy": 120}),
     "bag_policies": Source("bag", {"bag_diffusion_weak": 150, "bag_diffusion_strong": 50}, policies=True, seconds=10.0),
+    "bag_pulls": Source("bag", {"open_end": 80, "middle": 30, "closed_end": 50, "side_to_side": 40}, astray=0.3),
     "bag_middle": Source("bag", {"middle": 100}, astray=0.8),
     "bag_strong": Source("bag", {"middle": 240}, astray=0.8, pushed=0.1),
     "bag_weak": Source("bag", {"closed_end": 240}, variant="sealed", astray=0.8, pushed=0.1),

@@ -55,7 +55,7 @@ def _turn_to(scene: FrankaScene, yaw: float) -> float:
 
 # The bag
 
-GRASPED = {"open_end": bag.MOUTH, "middle": bag.MIDDLE, "closed_end": bag.TAIL}
+GRASPED = {"open_end": bag.MOUTH, "middle": bag.MIDDLE, "closed_end": bag.TAIL, "side_to_side": bag.TAIL}
 """Behaviour -> the segment that it lifts the bag by."""
 
 
