@@ -19,6 +19,7 @@ from lerobot_latentsafe.checkpoint import TRAINED
 from lerobot_latentsafe.chunks import ChunksAhead, queued_actions
 from lerobot_latentsafe.datasets.frame_cache import check_proportions
 from lerobot_latentsafe.filter import FilterDecision, Reason, least_restrictive
+from lerobot_latentsafe.memory import keep_freed_memory
 from lerobot_latentsafe.world_models.base import Latent, map_latent, replace_rows
 
 if TYPE_CHECKING:
@@ -40,6 +41,7 @@ class Shield:
 
     def __init__(self, filter: "LatentSafePolicy", clock: Callable[[], float] = time.perf_counter):
         self.filter, self.clock = filter, clock
+        keep_freed_memory()
         self._twins: weakref.WeakKeyDictionary[Shield, bool] = weakref.WeakKeyDictionary()
         self.reset()
         _shields.add(self)
@@ -166,7 +168,7 @@ class Shield:
         for key in model.world_model.image_keys:
             image = observation[key].to(model.device)
             check_proportions(key, tuple(image.shape[1:]), config.input_features[key].shape)
-            low, high = torch.aminmax(image.flatten(1), dim=1)  # NaN if anything is
+            low, high = image.amin((1, 2, 3)), image.amax((1, 2, 3))  # NaN if anything is; aminmax is five times slower
             usable = torch.isfinite(low) & torch.isfinite(high) & (low >= -1e-3) & (high <= 1 + 1e-3)
             finite &= usable
             images[key] = model.model_images(image if usable.all() else image.nan_to_num(0.0).clamp(0, 1)).clamp(0, 1)

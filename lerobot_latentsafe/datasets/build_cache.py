@@ -27,6 +27,7 @@ from lerobot_latentsafe.datasets.frame_cache import (
     dataset_fingerprint,
     to_model_images,
 )
+from lerobot_latentsafe.memory import keep_freed_memory
 
 if TYPE_CHECKING:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
@@ -197,6 +198,7 @@ def build_frame_cache(
     frames = DatasetFrames(dataset.meta)
     see = lambda episode: _episode_images(frames, episode, image_size)  # noqa: E731
     kept = recipe(frames.cameras, image_size)
+    keep_freed_memory()
     if rank == 0 and not unfinished:
         _lay_out(dataset, output_dir, kept, see)
     _await_layout(dataset, folder, kept)
