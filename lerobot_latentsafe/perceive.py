@@ -284,8 +284,27 @@ def with_aim(
     copy = add_features(
         dataset, {OBS_ENV_STATE: (seen.numpy(), feature)}, output_dir=output_dir, repo_id=f"{repo_id}_seen"
     )
-    save_file(aim.state_dict(), Path(output_dir) / AIM)
+    save_file(aim.state_dict(), Path(output_dir) / AIM, metadata={"fingerprint": cache.manifest["fingerprint"]})
     return copy
+
+
+def check_seen(seen: str | Path, cache_root: str | Path) -> None:
+    """Refuse aims that `with_aim` learned on another dataset than the cache's.
+
+    Raises:
+        FrameCacheError
+    """
+    from safetensors import safe_open
+
+    from lerobot_latentsafe.datasets.frame_cache import FrameCache, FrameCacheError
+
+    with safe_open(Path(seen) / AIM, "pt") as file:
+        known = (file.metadata() or {}).get("fingerprint")
+    expected = FrameCache.open(cache_root).manifest["fingerprint"]
+    if known != expected:
+        raise FrameCacheError(
+            f"{seen} was learned on dataset {known}, {cache_root} holds {expected}; delete {seen} and learn anew"
+        )
 
 
 def let_see(checkpoint: str | Path, cache_root: str | Path, seen: str | Path, output_dir: str | Path) -> None:
@@ -296,6 +315,7 @@ def let_see(checkpoint: str | Path, cache_root: str | Path, seen: str | Path, ou
 
     Raises:
         FileExistsError: output_dir exists.
+        FrameCacheError: `seen` is of another dataset.
     """
     from lerobot.configs.policies import PreTrainedConfig
     from lerobot.policies.factory import make_pre_post_processors
@@ -306,6 +326,7 @@ def let_see(checkpoint: str | Path, cache_root: str | Path, seen: str | Path, ou
     checkpoint, output_dir = Path(checkpoint), Path(output_dir)
     if output_dir.exists():
         raise FileExistsError(f"{output_dir} exists; choose another folder or delete it")
+    check_seen(seen, cache_root)
     cache = FrameCache.open(cache_root)
     manifest = cache.manifest
     config, cameras = PreTrainedConfig.from_pretrained(checkpoint), sorted(manifest["cameras"])

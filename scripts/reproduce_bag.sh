@@ -80,7 +80,7 @@ done
 
 for kind in weak strong; do
   [ -e "$OUT/diffusion_$kind" ] || $BIN/python scripts/train_seeing_policy.py --dataset="$DATA/bag_$kind" \
-    --output="$OUT/diffusion_$kind"
+    --output="$OUT/diffusion_$kind" --half
 done
 
 # The experiments: 6 CPU-seconds an episode of an operator, 11 to 17 of a policy, which is longer. Committed weights have

@@ -28,9 +28,10 @@ from lerobot.optim.factory import make_optimizer_and_scheduler
 from lerobot.policies.factory import make_policy, make_pre_post_processors
 from tqdm import trange
 
-from lerobot_latentsafe.datasets.frame_cache import FOLDER, MANIFEST
+from lerobot_latentsafe.datasets.frame_cache import FOLDER, MANIFEST, FrameCache
 from lerobot_latentsafe.datasets.windows import Windows
-from lerobot_latentsafe.perceive import AIM, SWITCH, let_see, switched, with_aim
+from lerobot_latentsafe.perceive import AIM, SWITCH, check_seen, let_see, switched, with_aim
+from lerobot_latentsafe.training import halve_weights
 
 OPEN_FINGERS = 3
 """How much likelier a frame before the fingers close is drawn: what is hard is to get there."""
@@ -79,23 +80,28 @@ def main() -> None:
     parser.add_argument("--output", type=Path, required=True)
     parser.add_argument("--steps", type=int)
     parser.add_argument("--seed", type=int)
+    parser.add_argument("--half", action="store_true", help="store 16-bit weights")
     parser.add_argument("--device", default="cpu", help="to train on")
     arguments = parser.parse_args()
     repo_id = arguments.repo_id or f"latentsafe/{arguments.dataset.name}"
-    LeRobotDatasetMetadata(repo_id, root=arguments.dataset)  # refuse what is no dataset before any work
+    meta = LeRobotDatasetMetadata(repo_id, root=arguments.dataset)  # refuse what is no dataset before any work
     beside = {what: arguments.dataset.with_name(f"{arguments.dataset.name}_{what}") for what in ("tokens", "seen")}
     if not (beside["tokens"] / FOLDER / MANIFEST).exists():
         command = [sys.executable, "-m", "lerobot_latentsafe.cli", "cache", "--encoder=auto"]
         command += [f"--dataset.repo_id={repo_id}", f"--dataset.root={arguments.dataset}"]
         subprocess.run([*command, f"--output_dir={beside['tokens']}"], check=True)
+    FrameCache.open(beside["tokens"], meta)  # refuse what was made of another dataset
     if not (beside["seen"] / AIM).exists():
         with_aim(beside["tokens"], f"{repo_id}_cache", beside["seen"], device=arguments.device)
+    check_seen(beside["seen"], beside["tokens"])
     config = draccus.parse(TrainPipelineConfig, CONFIG, args=[])
     config.steps, config.seed = arguments.steps or config.steps, arguments.seed or config.seed
     config.policy.device = arguments.device
     dataset = LeRobotDataset(f"{repo_id}_cache_seen", root=beside["seen"])
     trained = train(config, dataset, arguments.output.with_name(f"{arguments.output.name}_training"))
     let_see(trained, beside["tokens"], beside["seen"], arguments.output)
+    if arguments.half:
+        halve_weights(arguments.output)
 
 
 if __name__ == "__main__":

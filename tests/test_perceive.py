@@ -6,12 +6,22 @@ import tiny
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import OBS_ENV_STATE
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 
 from lerobot_latentsafe import perceive
 from lerobot_latentsafe.datasets.frame_cache import FrameCache, FrameCacheError
 from lerobot_latentsafe.envs.dubins import ACTION_NAMES, STATE_NAMES
-from lerobot_latentsafe.perceive import Aim, PerceiveStep, TwoValuedStep, let_see, two_valued, until_switched, with_aim
+from lerobot_latentsafe.perceive import (
+    AIM,
+    Aim,
+    PerceiveStep,
+    TwoValuedStep,
+    check_seen,
+    let_see,
+    two_valued,
+    until_switched,
+    with_aim,
+)
 from lerobot_latentsafe.shield import BasePolicy
 
 REPO_ID = tiny.REPO_ID + "_cache"
@@ -131,6 +141,13 @@ def test_missing_camera_is_named(seeing):
 def test_existing_folder_is_left_alone(seeing, seen, token_root):
     with pytest.raises(FileExistsError, match="choose another"):
         let_see(seeing, token_root, seen.root, seeing)
+
+
+def test_aims_of_another_dataset_are_refused(seen, token_root, tmp_path):
+    check_seen(seen.root, token_root)
+    save_file({"x": torch.zeros(1)}, tmp_path / AIM, metadata={"fingerprint": "another"})
+    with pytest.raises(FrameCacheError, match=r"another.*learn anew"):
+        let_see(tmp_path, token_root, tmp_path, tmp_path / "seeing")
 
 
 def test_pictures_are_no_views(cache_root, tmp_path):
