@@ -11,9 +11,10 @@ setup:
 demo: setup
 	$(PYTHON) scripts/demo.py
 
-# The committed filter of the bag, or another, and a policy to be shielded if there is one:
+# The committed filter of the bag, or another, and the policy to be shielded, or none (BASE=):
 # make demo-bag POLICY=<filter> BASE=<policy>
 POLICY ?= bag
+BASE ?= bag_diffusion_weak
 demo-bag: setup
 	MUJOCO_GL=$${MUJOCO_GL:-egl} $(PYTHON) scripts/demo_bag.py --policy="$(POLICY)" $(if $(BASE),--base="$(BASE)")
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""A filter of the bag at work: operators, and a policy if one is given, bare and shielded from the same starts.
+"""A filter of the bag at work: a policy, if one is given, and operators, bare and shielded from the same starts.
 
 Nothing is trained. Runs scripts/bag_operators.py and scripts/bag_policies.py, small enough for two cores, and writes
 outputs/demo_bag/report.html and outputs/demo_bag/metrics.json. Numbers of full size are in results/bag.
@@ -29,8 +29,8 @@ def run(demo: Demo, filter: str, base: str | None, law: str, n: int) -> None:
         )
         for name, does in OPERATORS.items()
     ]
-    if base is not None:
-        steps.append((
+    if base is not None:  # first, for it takes longest
+        steps.insert(0, (
             f"policies: {n} starts of the policy, bare and shielded",
             *("python", "scripts/bag_policies.py", f"--weak={base}", *options),
             *(f"--n={n}", "--n_videos=3", f"--output={demo.out}/policies.json"),
@@ -78,9 +78,10 @@ def report(out: Path, law: str, seconds: float) -> None:
         "A latent safety filter keeps candies in an open bag",
         [
             html.paragraph(
-                "A robot should lift an open bag without spilling, and an operator pulls as if the bag were sealed. "
-                "The filter sees two cameras and the arm's own state; it lets the operator act, and takes over when "
-                "nothing else would keep the candies inside. Who lifts the open end it should leave alone."
+                "A robot should lift an open bag without spilling, but operators, and policies that learned from them, "
+                "may pull as if it were sealed. The filter sees two cameras and the arm's own state; it lets them act, "
+                "and takes over when nothing else would keep the candies inside. Who lifts the open end it should "
+                "leave alone."
             ),
             html.heading("Bare and shielded from the same starts"),
             html.table(header, rows),
@@ -122,7 +123,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("outputs/demo_bag"))
     parser.add_argument("--policy", default="bag", help="the filter: a folder, a Hub id or a committed name")
     parser.add_argument("--base", help="a policy to be shielded, likewise")
-    parser.add_argument("--n", type=int, default=20, help="starts of the policy; operators get half as many")
+    parser.add_argument("--n", type=int, default=16, help="starts of the policy; operators get half as many")
     arguments = parser.parse_args()
     law = read_config(resolve_checkpoint(arguments.policy)).law
     if arguments.base:
