@@ -1,5 +1,7 @@
 """The GRU on whole frames: the contract, open-loop learning, and the control that is blind."""
 
+from dataclasses import replace
+
 import pytest
 import tiny
 import torch
@@ -64,6 +66,46 @@ def test_gradients_reach_the_action(model):
     latent = model.step(select(filtered(model, random_clip(), 2), slice(4)), action)
     model.features(latent).square().sum().backward()
     assert action.grad.isfinite().all() and (action.grad != 0).any()
+
+
+def test_a_summary_sees_what_is_small_and_the_margin_alone_teaches_it():
+    torch.manual_seed(0)
+    model = tiny.gru_config(summary=4).build(["observation.image"], STATE_DIM, ACTION_DIM)
+    n_patches, token_dim = model.perception.n_patches, model.perception.token_dim
+    assert model.percept_names == ["vector", "tokens"] and model.sizes["vector"] == tiny.COMPONENTS + 8
+
+    def clip_with_a_spot():
+        clip = random_clip()
+        spot = torch.rand(len(clip.state), n_patches).argsort(-1) < torch.randint(2, (len(clip.state), 1))
+        tokens = torch.randn(*clip.state.shape[:2], n_patches, token_dim)
+        tokens[..., 0] += 6 * spot[:, None]
+        return replace(clip, percepts={**clip.percepts, "tokens": tokens}), spot.any(-1)
+
+    head = torch.nn.Linear(model.feature_dim, 1)
+    optimizer = torch.optim.Adam([*model.parameters(), *head.parameters()], 1e-2)
+    for step in range(150):
+        clip, there = clip_with_a_spot()
+        loss, features, _ = model.loss(clip)
+        if step == 0:
+            loss.backward(retain_graph=True)
+            assert all(weight.grad is None for weight in model.summary.parameters())
+        margin = torch.nn.functional.softplus(
+            head(
+                features[
+                    :,
+                    0,
+                    :,
+                ]
+            )[:, 0]
+            * (2.0 * there - 1)
+        ).mean()
+        optimizer.zero_grad()
+        (0.01 * loss + margin).backward()
+        optimizer.step()
+    clip, there = clip_with_a_spot()
+    latent = model.eval().observe(None, None, {k: v[:, 0] for k, v in clip.percepts.items()}, clip.state[:, 0])
+    found = head(model.features(latent))[:, 0] < 0
+    assert (found == there).float().mean() > 0.9
 
 
 def learn(blind):

@@ -21,7 +21,7 @@ from lerobot_latentsafe.ranks import from_first_rank, mean_over_ranks
 from lerobot_latentsafe.world_models.base import Clip, Latent, WorldModelConfig
 from lerobot_latentsafe.world_models.ends import EndAware
 from lerobot_latentsafe.world_models.frame_transformer import FrameTransformer, Linear
-from lerobot_latentsafe.world_models.perception import Perception, PerceptionConfig
+from lerobot_latentsafe.world_models.perception import PatchSummary, Perception, PerceptionConfig
 
 CONDITIONINGS = ("adaln", "concat")
 MOST_WEIGHT = 5.0
@@ -133,9 +133,7 @@ class DinoWM(EndAware):
             _change_decoder(d, config.decoder_layers, token_dim // len(image_keys)) for _ in self.image_keys
         )
         self.state_decoder = _change_decoder(d + state_dim + action_dim, config.decoder_layers, state_dim)
-        self.summary_in, self.summary_out = Linear(token_dim, width), Linear(width, width)
-        self.summary_position = nn.Parameter(torch.randn(n_patches, width))
-        self.summary_norm = nn.LayerNorm(2 * width)
+        self.summary = PatchSummary(n_patches, token_dim, width)
         self.feature_dim = 2 * width + d + state_dim
         self.continues = nn.Sequential(nn.Linear(self.feature_dim, 64), nn.SiLU(), nn.Linear(64, 1))
         self.sizes = {"tokens": (n_patches, token_dim), "state": (state_dim,), "context": (d,), "action": (action_dim,)}
@@ -182,9 +180,7 @@ class DinoWM(EndAware):
         return {**predicted, "tokens": self._looked_at(percepts), "state": state}
 
     def features(self, latent: Latent) -> Tensor:
-        patches = self.summary_out(F.gelu(self.summary_in(latent["tokens"]) + self.summary_position))
-        pooled = self.summary_norm(torch.cat([patches.mean(-2), patches.amax(-2)], -1))
-        return torch.cat([pooled, latent["context"], latent["state"]], -1)
+        return torch.cat([self.summary(latent["tokens"]), latent["context"], latent["state"]], -1)
 
     def error(self, latent: Latent, percepts: dict[str, Tensor], state: Tensor) -> Tensor:
         if self.config.blind:

@@ -2,7 +2,8 @@
 
 z_t = (h_t, v_t, s_t): h_t remembers what was done and seen, v_t are the leading principal components of all the frame's
 tokens, s_t is proprioception. v and s are predicted as changes. A frame is one vector here, not a grid of tokens as in
-DINO-WM, which makes imagination cheap.
+DINO-WM, which makes imagination cheap. With a `summary`, v_t also tells what is small, which components of whole frames
+do not show; what that is the margin teaches, for the frames that are observed.
 
 Trained open loop: a few frames are observed, the rest of the clip is imagined under the recorded actions. One-step
 losses teach a model to copy the last frame and to ignore the action (see `evaluation/world_model.py`).
@@ -16,7 +17,7 @@ from torch import Tensor, nn
 
 from lerobot_latentsafe.ranks import mean_over_ranks
 from lerobot_latentsafe.world_models.base import Clip, Latent, WorldModel, WorldModelConfig, replace_rows
-from lerobot_latentsafe.world_models.perception import Perception, PerceptionConfig
+from lerobot_latentsafe.world_models.perception import PatchSummary, Perception, PerceptionConfig
 
 
 @WorldModelConfig.register_subclass("gru")
@@ -26,6 +27,7 @@ class GRUConfig(WorldModelConfig):
 
     Attributes:
         perception: the frozen encoder, and how many principal components of its tokens make a frame's vector.
+        summary: width of the learned patch features whose mean and maximum over patches v ends with; 0: none.
         hidden, units: sizes of h and of the layers around it.
         observed: frames of a clip that are seen before imagination starts, at most.
         blind: see no images, only proprioception: the control that a model which looks must beat.
@@ -34,6 +36,7 @@ class GRUConfig(WorldModelConfig):
     perception: PerceptionConfig = field(default_factory=PerceptionConfig)
     image_size: int = 96
     clip_length: int = 20
+    summary: int = 0
     hidden: int = 256
     units: int = 256
     observed: int = 6
@@ -58,6 +61,9 @@ class FrameGRU(WorldModel):
         self.config, self.image_keys, self.action_dim = config, sorted(image_keys), action_dim
         self.perception = Perception(config.perception, self.image_keys, config.image_size)
         n_vector, units = config.perception.components, config.units
+        if config.summary:
+            self.summary = PatchSummary(self.perception.n_patches, self.perception.token_dim, config.summary)
+            n_vector += 2 * config.summary
         self.sizes = {"hidden": config.hidden, "vector": n_vector, "state": state_dim, "action": action_dim}
         self.feature_dim = config.hidden + n_vector + state_dim
         self.frame_in = nn.Sequential(nn.Linear(n_vector + state_dim, units), nn.SiLU())
@@ -72,13 +78,14 @@ class FrameGRU(WorldModel):
 
     @property
     def percept_names(self) -> list[str]:
-        return ["vector"]
+        return ["vector", "tokens"] if self.config.summary else ["vector"]
 
     def load_basis(self, cache: Path) -> None:
         self.perception.load_basis(cache)
 
     def perceive(self, images: dict[str, Tensor]) -> dict[str, Tensor]:
-        return {"vector": self.perception(images)["vector"]}
+        seen = self.perception(images)
+        return {name: seen[name] for name in self.percept_names}
 
     def initial(self, batch_size: int) -> Latent:
         weight = self.change[-1].weight
@@ -92,8 +99,14 @@ class FrameGRU(WorldModel):
         return {"hidden": hidden, "vector": vector, "state": state, "action": action}
 
     def correct(self, predicted: Latent, percepts: dict[str, Tensor], state: Tensor) -> Latent:
-        vector = torch.zeros_like(percepts["vector"]) if self.config.blind else percepts["vector"]
-        return {**predicted, "vector": vector, "state": state}
+        return {**predicted, "vector": self._vector(percepts), "state": state}
+
+    def _vector(self, percepts: dict[str, Tensor]) -> Tensor:
+        """v of frames (..., C)."""
+        vector = percepts["vector"]
+        if self.config.summary:
+            vector = torch.cat([vector, self.summary(percepts["tokens"])], -1)
+        return torch.zeros_like(vector) if self.config.blind else vector
 
     def features(self, latent: Latent) -> Tensor:
         return torch.cat([latent["hidden"], latent["vector"], latent["state"]], -1)
@@ -109,16 +122,17 @@ class FrameGRU(WorldModel):
         """Squared errors of all predicted frames, in units of what changes from one frame to the next."""
         length = clip.state.shape[1]
         observed = int(torch.randint(1, self.config.observed + 1, ()))
-        seen = {**clip.percepts, "state": clip.state}
+        vector = self._vector(clip.percepts)
+        seen = {"vector": vector.detach(), "state": clip.state}  # what is to be seen the margin alone teaches
         latent = start = self.initial(len(clip.state))
         predicted, rows = [], []
         for t in range(length):
             first = clip.is_first[:, t]
             latent = self.step(replace_rows(latent, start, where=first), clip.action[:, t])
             predicted.append(latent)
-            corrected = self.correct(latent, {"vector": seen["vector"][:, t]}, clip.state[:, t])
+            corrected = {**latent, **{name: frames[:, t] for name, frames in seen.items()}}
             latent = corrected if t < observed else replace_rows(latent, corrected, where=first)
-            rows.append(self.features(latent))
+            rows.append(self.features({**latent, "vector": vector[:, t]} if t < observed else latent))
         counts = (clip.valid & ~clip.is_first)[..., None].float()
         counts[:, 1:] *= clip.valid[:, :-1, None]
         names = ("state",) if self.config.blind else ("vector", "state")

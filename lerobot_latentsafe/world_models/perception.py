@@ -5,10 +5,12 @@ from pathlib import Path
 from typing import ClassVar
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from lerobot_latentsafe.datasets.frame_cache import BASIS, FOLDER, FrameCacheError
 from lerobot_latentsafe.world_models.encoders import PatchEncoder, load_encoder
+from lerobot_latentsafe.world_models.frame_transformer import Linear
 
 LIVE = 64
 """So many pictures at most are of robots that act now, and are remembered until the next ones."""
@@ -85,6 +87,23 @@ class FrameBasis(nn.Module):
         self.mean.copy_(flat.mean(0))
         self.axes.copy_(axes[:, :n_components] / scale)
         self.fitted.fill_(True)
+
+
+class PatchSummary(nn.Module):
+    """What is learned of a frame's patches, its mean and maximum over them: tokens (..., P, C) -> (..., 2 width).
+
+    What is small, a candy on a table, is all there is to see in its patch and nothing to components of whole frames.
+    """
+
+    def __init__(self, n_patches: int, token_dim: int, width: int):
+        super().__init__()
+        self.enter, self.leave = Linear(token_dim, width), Linear(width, width)
+        self.position = nn.Parameter(torch.randn(n_patches, width))
+        self.norm = nn.LayerNorm(2 * width)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        patches = self.leave(F.gelu(self.enter(tokens) + self.position))
+        return self.norm(torch.cat([patches.mean(-2), patches.amax(-2)], -1))
 
 
 class Perception(nn.Module):
