@@ -31,6 +31,12 @@ def test_summary_counts_what_is_lost_and_overridden():
     assert cell["decision_cpu_ms"]["p99"] == pytest.approx(10)  # the first decisions warm up
 
 
+def test_summary_counts_spills_that_the_margin_does_not_see():
+    late = {"spilled": [0, 1, 2, 2], "margin": [-0.5, 0.5, 0.5, -0.5]}
+    cell = bag.summary([row(2) | late, row(0)], n_candies=24)
+    assert cell["seen_after_a_spill"] == {"n": 2, "called_safe": 1}
+
+
 def test_summary_of_an_operator_alone_says_nothing_of_a_filter():
     bare = row(0) | {"value": [], "intervened": [], "cost": []}
     cell = bag.summary([bare], n_candies=24)

@@ -215,7 +215,10 @@ def summary(rows: list[dict], n_candies: int) -> dict:
     }
     if any(row["value"] for row in rows):
         firsts = [row["first"] for row in rows if row["first"] is not None]
+        # The margin of a step is that of the state before it.
+        late = [l > 0 for row in rows for l, spilled in zip(row["margin"][1:], row["spilled"]) if spilled]
         result |= {
+            "seen_after_a_spill": {"n": len(late), "called_safe": sum(late)},
             "overridden_share": float(np.mean([row["overridden"] / len(row["spilled"]) for row in rows])),
             "episodes_overridden": len(firsts),
             "median_first_override": float(np.median(firsts)) if firsts else None,
