@@ -122,8 +122,9 @@ class FrameGRU(WorldModel):
         """Squared errors of all predicted frames, in units of what changes from one frame to the next."""
         length = clip.state.shape[1]
         observed = int(torch.randint(1, self.config.observed + 1, ()))
-        vector = self._vector(clip.percepts)
-        seen = {"vector": vector.detach(), "state": clip.state}  # what is to be seen the margin alone teaches
+        shown = self._vector({name: frames[:, :observed] for name, frames in clip.percepts.items()})
+        with torch.no_grad():  # what is to be seen the margin alone teaches
+            seen = {"vector": self._vector(clip.percepts), "state": clip.state}
         latent = start = self.initial(len(clip.state))
         predicted, rows = [], []
         for t in range(length):
@@ -132,7 +133,7 @@ class FrameGRU(WorldModel):
             predicted.append(latent)
             corrected = {**latent, **{name: frames[:, t] for name, frames in seen.items()}}
             latent = corrected if t < observed else replace_rows(latent, corrected, where=first)
-            rows.append(self.features({**latent, "vector": vector[:, t]} if t < observed else latent))
+            rows.append(self.features({**latent, "vector": shown[:, t]} if t < observed else latent))
         counts = (clip.valid & ~clip.is_first)[..., None].float()
         counts[:, 1:] *= clip.valid[:, :-1, None]
         names = ("state",) if self.config.blind else ("vector", "state")
