@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from tiny import save_franka_filter
 
 from lerobot_latentsafe.datasets import collect_franka
 from lerobot_latentsafe.datasets.collect_franka import SOURCES, Source
@@ -113,6 +114,9 @@ def test_what_the_operator_of_a_pushed_hand_wants_is_recorded(tiny):
 class Closes:
     """A policy that closes the fingers at its third step and then moves up and sideways."""
 
+    up = 0.9
+    """More than the limits allow."""
+
     def __init__(self, path, device):
         self.executed = []
 
@@ -122,7 +126,7 @@ class Closes:
     def propose(self, batch):
         assert batch["observation.images.front"].max() <= 1 and batch["observation.state"].shape == (1, 14)
         self.steps += 1
-        return torch.tensor([[0.001, 0, 0.9, 0, 0, 0, float(self.steps < 3)]])  # more than the limits allow
+        return torch.tensor([[0.001, 0, self.up, 0, 0, 0, float(self.steps < 3)]])
 
     def replan(self, executed):
         self.executed.append(executed[0, :7].numpy())
@@ -138,7 +142,7 @@ def test_a_policy_is_recorded_as_it_acts_and_is_overridden(tiny, monkeypatch):
     source = Source("blocks", {"closes": 2}, policies=True, seconds=3.0)
     with LatentSafeFrankaMujoco(LatentSafeFrankaMujocoConfig(scene="blocks", image_size=32)) as robot:
         runs = [list(collect_franka.episode_frames(robot, source, episode, 0)) for episode in (0, 0, 1)]
-    operator = collect_franka._policy_operator("closes", 20)
+    operator = collect_franka._policy_operator("closes", 20, None)
     collect_franka._policy_operator.cache_clear()
     actions = np.stack([[frame["action"] for frame in frames] for frames in runs])
     assert actions.shape == (3, 60, 7)
@@ -150,6 +154,26 @@ def test_a_policy_is_recorded_as_it_acts_and_is_overridden(tiny, monkeypatch):
     assert (actions[overridden][:, 2] <= 0).all() and (actions[overridden][:, 6] == 0).all()
     # What was done instead is told to the policy, step by step.
     np.testing.assert_array_equal(np.stack(operator.policy.executed), actions[overridden])
+
+
+def test_a_filter_may_override_instead(tiny, tmp_path, monkeypatch):
+    from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+    from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
+    from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
+
+    monkeypatch.setattr(Closes, "up", 0.01)
+    monkeypatch.setattr(LatentSafePolicy, "attach", lambda self, path: setattr(self, "_base", [Closes(path, "cpu")]))
+    for epsilon, passes in ((2.0, False), (-2.0, True)):
+        path = str(save_franka_filter(tmp_path / str(epsilon), epsilon=epsilon))
+        source = Source("blocks", {"closes": 1}, policies=True, shield=path, seconds=0.5)
+        with LatentSafeFrankaMujoco(LatentSafeFrankaMujocoConfig(scene="blocks", image_size=32)) as robot:
+            frames = list(collect_franka.episode_frames(robot, source, 0, 0))
+        actions = np.stack([frame["action"] for frame in frames])
+        assert ((actions[:, 0] == np.float32(0.001)) == passes).all()
+        # What was done instead is told to the policy, step by step.
+        told = collect_franka._policy_operator("closes", 20, path).policy.base.executed
+        np.testing.assert_allclose(np.reshape(told, (-1, 7)), actions[:0] if passes else actions, atol=1e-6)
+    collect_franka._policy_operator.cache_clear()
 
 
 def test_mixes_keep_their_proportions():

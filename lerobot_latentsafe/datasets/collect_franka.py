@@ -49,6 +49,7 @@ class Source:
             are closed, while the operator keeps them open. Recorded is what the operator commands, so that a policy
             learns to correct and not to stray (DART, Laskey et al. 2017).
         policies: the behaviours are names of policies, which are overridden now and then; see `policy_operator.py`.
+        shield: name of the filter that overrides them instead.
         seconds: how long an episode lasts; None: as long as the scene's.
     """
 
@@ -61,6 +62,7 @@ class Source:
     astray: float = 0.0
     pushed: float = 0.0
     policies: bool = False
+    shield: str | None = None
     seconds: float | None = None
 
     @property
@@ -84,6 +86,9 @@ SOURCES: dict[str, Source] = {
     ),
     "bag_clumsy": Source("bag", {"clumsy": 120}),
     "bag_policies": Source("bag", {"bag_diffusion_weak": 150, "bag_diffusion_strong": 50}, policies=True, seconds=10.0),
+    "bag_shielded": Source(
+        "bag", {"bag_diffusion_weak": 150, "bag_diffusion_strong": 50}, policies=True, shield="bag", seconds=10.0
+    ),
     "bag_pulls": Source("bag", {"open_end": 80, "middle": 30, "closed_end": 50, "side_to_side": 40}, astray=0.3),
     "bag_middle": Source("bag", {"middle": 100}, astray=0.8),
     "bag_strong": Source("bag", {"middle": 240}, astray=0.8, pushed=0.1),
@@ -234,7 +239,7 @@ def _operator(
 
     behavior = source.behavior(episode)
     if source.policies:
-        operator = _policy_operator(behavior, robot.scene.fps)
+        operator = _policy_operator(behavior, robot.scene.fps, source.shield)
         operator.begin(robot.scene.seed)
         yield operator.act
         return
@@ -243,10 +248,10 @@ def _operator(
 
 
 @cache
-def _policy_operator(path: str, fps: int) -> "PolicyOperator":
+def _policy_operator(path: str, fps: int, shield: str | None) -> "PolicyOperator":
     from lerobot_latentsafe.datasets.policy_operator import PolicyOperator
 
-    return PolicyOperator(path, fps, OVERRIDDEN)
+    return PolicyOperator(path, fps, OVERRIDDEN, shield)
 
 
 def _pushes(sd: float, n: int, rng: np.random.Generator) -> np.ndarray:

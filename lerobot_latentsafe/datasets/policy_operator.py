@@ -10,6 +10,7 @@ from lerobot.utils.constants import OBS_IMAGES, OBS_STATE, OBS_STR
 from lerobot.utils.feature_utils import build_dataset_frame
 
 from lerobot_latentsafe.envs.franka import CAMERAS
+from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, STATE_NAMES, action_limits
 from lerobot_latentsafe.shield import BasePolicy
 
@@ -23,19 +24,27 @@ CLOSING = 0.5
 
 
 class PolicyOperator:
-    """Acts as a policy does; while the fingers close, it is now and then overridden by hold or by the way down.
+    """Acts as a policy does that a filter overrides: what it does next it does in no other recording.
 
-    Filters override like that, and what a policy does next it does in no other recording.
+    Either by a filter; or, for want of one that is any good yet, now and then while the fingers close, by hold or by
+    the way down.
 
     Args:
         path: of the policy; folder, Hub id or committed name.
         fps: of the robot.
         overridden: chance that an override begins at a step.
+        shield: path of a filter that overrides instead.
     """
 
-    def __init__(self, path: str, fps: int, overridden: float):
-        self.policy, self.overridden = BasePolicy(path, "cpu"), overridden
+    def __init__(self, path: str, fps: int, overridden: float, shield: str | None = None):
         self.limits = action_limits(fps)
+        if shield is None:
+            self.policy, self.overridden = BasePolicy(path, "cpu"), overridden
+            self.propose = self.policy.propose
+        else:
+            self.policy, self.overridden = LatentSafePolicy.from_pretrained(shield).eval(), 0.0
+            self.policy.attach(path)
+            self.propose = self.policy.select_action
 
     def begin(self, seed: int) -> None:
         """Start an episode; what follows depends on the seed and on what is seen."""
@@ -48,7 +57,7 @@ class PolicyOperator:
         """The action for an observation of a LeRobot robot, clipped into its limits."""
         batch = prepare_observation_for_inference(build_dataset_frame(OBSERVED, seen, OBS_STR), torch.device("cpu"))
         with torch.no_grad():
-            action = np.clip(self.policy.propose(batch)[0].double().numpy(), *self.limits)
+            action = np.clip(self.propose(batch)[0].double().numpy(), *self.limits)
         if self._interrupts():
             action = np.append(self.override, self.gripper)
             self.policy.replan(torch.from_numpy(action).float()[None])
