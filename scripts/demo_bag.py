@@ -123,7 +123,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("outputs/demo_bag"))
     parser.add_argument("--policy", default="bag", help="the filter: a folder, a Hub id or a committed name")
     parser.add_argument("--base", help="a policy to be shielded, likewise")
-    parser.add_argument("--n", type=int, default=16, help="starts of the policy; operators get half as many")
+    parser.add_argument("--n", type=int, default=12, help="starts of the policy; operators get half as many")
     arguments = parser.parse_args()
     law = read_config(resolve_checkpoint(arguments.policy)).law
     if arguments.base:
