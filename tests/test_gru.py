@@ -89,16 +89,8 @@ def test_a_summary_sees_what_is_small_and_the_margin_alone_teaches_it():
         if step == 0:
             loss.backward(retain_graph=True)
             assert all(weight.grad is None for weight in model.summary.parameters())
-        margin = torch.nn.functional.softplus(
-            head(
-                features[
-                    :,
-                    0,
-                    :,
-                ]
-            )[:, 0]
-            * (2.0 * there - 1)
-        ).mean()
+        verdict = head(features[:, 0])[:, 0] * (2.0 * there - 1)
+        margin = torch.nn.functional.softplus(verdict).mean()
         optimizer.zero_grad()
         (0.01 * loss + margin).backward()
         optimizer.step()
