@@ -46,7 +46,8 @@ def test_folded_batch_norms_equal_their_definition(lite):
 
 
 def test_weights_have_a_hash_and_another_is_refused(lite):
-    assert lite.weights_hash() == load_encoder("efficientnet_lite0", lite.weights_hash()).weights_hash()
+    known = "02c835c4dbc686ce"  # on whatever processor, or a checkpoint made on another could not be loaded
+    assert lite.weights_hash() == load_encoder("efficientnet_lite0", known).weights_hash() == known
     with pytest.raises(EncoderError, match="0123456789abcdef were trained with"):
         load_encoder("efficientnet_lite0", "0123456789abcdef")
 

@@ -64,15 +64,19 @@ class PatchEncoder(nn.Module):
 
     def weights_hash(self) -> str:
         """Identifies the weights: the first 16 digits of a SHA-256 over all of them."""
-        digest = hashlib.sha256()
-        for name, tensor in sorted(self.state_dict().items()):
-            digest.update(name.encode())
-            digest.update(tensor.detach().cpu().contiguous().float().numpy().tobytes())
-        return digest.hexdigest()[:16]
+        return _hash(self.state_dict())
 
     def train(self, mode: bool = True) -> "PatchEncoder":
         """Stays in evaluation mode."""
         return super().train(False)
+
+
+def _hash(weights: dict[str, Tensor]) -> str:
+    digest = hashlib.sha256()
+    for name, tensor in sorted(weights.items()):
+        digest.update(name.encode())
+        digest.update(tensor.detach().cpu().contiguous().float().numpy().tobytes())
+    return digest.hexdigest()[:16]
 
 
 class DinoEncoder(PatchEncoder):
@@ -95,10 +99,10 @@ class _Conv(nn.Module):
     def __init__(self, weights: dict[str, Tensor], conv: str, norm: str, stride: int = 1, act: bool = True):
         super().__init__()
         weight = weights[f"{conv}.weight"]
-        scale = weights[f"{norm}.weight"] / (weights[f"{norm}.running_var"] + 1e-3).sqrt()
-        folded = (weight * scale[:, None, None, None]).contiguous(memory_format=torch.channels_last)
+        scale = weights[f"{norm}.weight"].double() / (weights[f"{norm}.running_var"].double() + 1e-3).sqrt()
+        folded = (weight * scale[:, None, None, None]).float().contiguous(memory_format=torch.channels_last)
         self.register_buffer("weight", folded)
-        self.register_buffer("bias", weights[f"{norm}.bias"] - weights[f"{norm}.running_mean"] * scale)
+        self.register_buffer("bias", (weights[f"{norm}.bias"] - weights[f"{norm}.running_mean"] * scale).float())
         self.stride, self.act = stride, act
         self.groups = len(weight) if weight.shape[1] == 1 else 1
 
@@ -138,8 +142,13 @@ class EfficientNetLite0(PatchEncoder):
 
     def __init__(self, weights: dict[str, Tensor]):
         super().__init__()
+        self._weights_hash = _hash(weights)
         blocks = [_Block(weights, i, stride) for i, stride in enumerate(self.strides)]
         self.net = nn.Sequential(_Conv(weights, "_conv_stem", "_bn0", 2), *blocks)
+
+    def weights_hash(self) -> str:
+        """Of the weights as they were published: once folded they differ among processors in the last bit."""
+        return self._weights_hash
 
     def tokens(self, images: Tensor) -> Tensor:
         grid = self.net(images.contiguous(memory_format=torch.channels_last))
