@@ -124,7 +124,8 @@ class FrameGRU(WorldModel):
         observed = int(torch.randint(1, self.config.observed + 1, ()))
         shown = self._vector({name: frames[:, :observed] for name, frames in clip.percepts.items()})
         with torch.no_grad():  # what is to be seen the margin alone teaches
-            seen = {"vector": self._vector(clip.percepts), "state": clip.state}
+            later = self._vector({name: frames[:, observed:] for name, frames in clip.percepts.items()})
+        seen = {"vector": torch.cat([shown.detach(), later], 1), "state": clip.state}
         latent = start = self.initial(len(clip.state))
         predicted, rows = [], []
         for t in range(length):
