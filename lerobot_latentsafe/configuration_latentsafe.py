@@ -39,6 +39,8 @@ class LatentSafeConfig(PreTrainedConfig):
             `latentsafe train-reachability`.
         epsilon: the filter intervenes where V of the predicted next latent is at or below this. A risk critic's V is
             -risk, so SQRL's threshold of 0.1 is an epsilon of -0.1.
+        release: once the filter has acted, the base policy acts again only where V is above this, if that is more than
+            epsilon. A policy that is given its way at every second step shakes what the fallback holds.
         guard: steps for which the proposed action is imagined held before V is asked. 1 is the paper's law; more give
             room for what the world model gets wrong, as time, which a saturated margin cannot.
         calibration: the evidence epsilon was chosen on; written by `latentsafe calibrate`.
@@ -60,8 +62,9 @@ class LatentSafeConfig(PreTrainedConfig):
         fps, state_names, action_names, action_low, action_high, state_mean, state_std: what the filter was trained
             on, in robot units; filled in from the dataset.
         kept_commands: actions that the fallback never changes, such as `gripper.pos`: it moves, but keeps its grip.
-        fallback_moves: the commands that a continuous fallback may move, such as `delta_z.pos`; None: all. Where the
-            data seldom show a motion, the world model only guesses what it does, and the fallback would exploit that.
+        fallback_moves: the commands that a continuous fallback may move, such as `delta_z.pos`, or in one direction
+            only, such as `-delta_z.pos`; None: all. Where the data seldom show a motion, the world model only guesses
+            what it does, and the fallback would exploit that.
         fallback_low, fallback_high: the range of the fallback's continuous actions, in [-1, 1]: that which the data
             cover. Set by `latentsafe train-reachability`.
         action_varies: False for commands the data never vary; the filter keeps those and knows nothing else of them.
@@ -86,6 +89,7 @@ class LatentSafeConfig(PreTrainedConfig):
     target: str = "reachability"
 
     epsilon: float = 0.0
+    release: float = -1.0
     guard: int = 1
     samples: int = 0
     calibration: dict[str, float] = field(default_factory=dict)
@@ -136,6 +140,8 @@ class LatentSafeConfig(PreTrainedConfig):
             raise ValueError(f"--policy.lookahead is {self.lookahead}; expected 0 (critic alone) to 25 imagined steps")
         if not 1 <= self.guard <= 25:
             raise ValueError(f"--policy.guard is {self.guard}; expected 1 (the paper's law) to 25 steps")
+        if not self.release < 1:
+            raise ValueError(f"--policy.release is {self.release}; expected less than 1, which V never exceeds")
         if self.samples < 0:
             raise ValueError(f"--policy.samples is {self.samples}; expected 0 (mean or mode) or a number of draws")
         if self.base_ahead < 0:

@@ -52,7 +52,7 @@ def least_restrictive(
     fallback: Tensor,
     value: Tensor,
     margin: Tensor,
-    epsilon: float,
+    epsilon: float | Tensor,
     fault: Tensor | None = None,
     monitor: bool = False,
 ) -> FilterDecision:
@@ -62,7 +62,7 @@ def least_restrictive(
         proposed, fallback: (B, A) in robot units.
         value: (B,) V of the next latent; a value that is not finite is never safe.
         margin: (B,) l of the current latent.
-        epsilon: threshold.
+        epsilon: threshold, or one for each row (B,).
         fault: (B,) a `Reason` for rows that must not pass whatever their value; 0 elsewhere.
         monitor: judge, but let every action through.
     """

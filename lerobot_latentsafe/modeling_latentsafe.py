@@ -61,7 +61,8 @@ class LatentSafePolicy(PreTrainedPolicy):
                 "--policy.type=latentsafe --dataset.repo_id=..., or load one with --policy.path=..."
             )
         config.validate_features()
-        unknown = [n for n in (*config.kept_commands, *(config.fallback_moves or [])) if n not in config.action_names]
+        named = (*config.kept_commands, *(name.lstrip("+-") for name in config.fallback_moves or []))
+        unknown = [name for name in named if name not in config.action_names]
         if unknown:
             raise ValueError(f"no action is named {', '.join(unknown)}; there are {', '.join(config.action_names)}")
         n_actions = len(config.action_low)
@@ -87,13 +88,12 @@ class LatentSafePolicy(PreTrainedPolicy):
     def new_critic(self, candidates: Tensor | None) -> SafetyCritic:
         """A critic with fresh weights, bounded to the commands the fallback may move."""
         names, chosen = self.config.action_names, self.config.fallback_moves
-        moves = self.action_varies & ~self.kept
-        moves &= torch.tensor([chosen is None or name in chosen for name in names], device=moves.device)
-        low, high = self.config.fallback_low, self.config.fallback_high
-        low = torch.tensor(low) if low else -torch.ones(len(moves))
-        high = torch.tensor(high) if high else torch.ones(len(moves))
+        moves, bounds = self.action_varies & ~self.kept, []
+        for sign, bound in (("-", self.config.fallback_low), ("+", self.config.fallback_high)):
+            allowed = [chosen is None or name in chosen or sign + name in chosen for name in names]
+            bound = torch.tensor(bound) if bound else float(sign + "1") * torch.ones(len(names))
+            bounds.append((bound * torch.tensor(allowed)).to(moves.device) * moves)
         sizes = self.world_model.feature_dim, len(moves), candidates, self.config.reachability
-        bounds = low.to(moves.device) * moves, high.to(moves.device) * moves
         return SafetyCritic(*sizes, *bounds, self.config.target).to(moves.device)
 
     @property

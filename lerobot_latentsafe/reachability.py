@@ -224,8 +224,7 @@ class SafetyCritic(nn.Module):
         """(K, A) actions worth holding: the candidates, or standing still (1, A) and the extremes of each command."""
         if self.discrete:
             return self.candidates
-        moves = self.high > self.low
-        extremes = [torch.diag(bound)[moves] for bound in (self.high, self.low)]
+        extremes = [torch.diag(bound)[bound != 0] for bound in (self.high, self.low)]
         return torch.cat([torch.zeros_like(self.low)[None] if still is None else still, *extremes])
 
     def between(self, share: Tensor) -> Tensor:
@@ -263,7 +262,8 @@ def look_ahead(
 
     The policies hold one action each; given a critic, its fallback policy is one more, and its value stands for all
     that comes after the horizon. Each outcome is a lower bound of V in the imagined world, up to the error of that
-    last value. With horizon 0 and a critic this is min(l, max_a Q).
+    last value. With horizon 0 and a critic this is min(l, max_a Q). Which is best is a matter of what is to come: a
+    failure that is there already would make all of them equal.
 
     Args:
         latent: N latents.
@@ -279,7 +279,8 @@ def look_ahead(
     now = imagination.margin(latent)
     n, n_policies = len(now), len(held) + (critic is not None)
     z = map_latent(latent, lambda t: t.repeat(n_policies, *[1] * (t.dim() - 1)))
-    worst, over = now.repeat(n_policies), torch.zeros(n * n_policies, dtype=torch.bool, device=now.device)
+    worst = torch.full((n * n_policies,), torch.inf, device=now.device)
+    over = torch.zeros_like(worst, dtype=torch.bool)
     action = first = held.repeat_interleave(n, 0)
     for t in range(horizon):
         if critic is not None:
@@ -294,7 +295,8 @@ def look_ahead(
         after = critic.value(imagination.features(z), imagination.margin(z))
         worst = torch.where(over, worst, torch.minimum(worst, after))
     best = worst.view(n_policies, n).max(0)
-    return best.values, first.view(n_policies, n, -1)[best.indices, torch.arange(n, device=now.device)]
+    action = first.view(n_policies, n, -1)[best.indices, torch.arange(n, device=now.device)]
+    return torch.minimum(now, best.values), action
 
 
 def discount(progress: float, config: ReachabilityConfig) -> float:

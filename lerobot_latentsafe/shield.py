@@ -50,6 +50,7 @@ class Shield:
         """Forget the history: call at the start of every episode."""
         self.latent: Latent | None = None
         self.executed: Tensor | None = None
+        self.acting: Tensor | None = None  # bool (B,), whether the filter did at the last tick
         self.decision: FilterDecision | None = None
         self.decided_at: float | None = None
         self._told = False
@@ -94,12 +95,20 @@ class Shield:
         if config.deadline_ms is not None and (finished - started) * 1e3 > config.deadline_ms:
             fault = _first_fault(fault, torch.ones_like(fault, dtype=torch.bool), Reason.DEADLINE_MISSED)
         decision = least_restrictive(
-            proposed, fallback, value, margin, config.epsilon, fault, monitor=config.mode == "monitor"
+            proposed, fallback, value, margin, self._threshold(), fault, monitor=config.mode == "monitor"
         )
         self.latent, self.decision, self.decided_at = latent, decision, finished
+        self.acting = decision.intervened
         self.executed = model.normalise_action(decision.action).nan_to_num(0.0).clamp(-1, 1)
         self._tell(decision)
         return decision
+
+    def _threshold(self) -> float | Tensor:
+        """What V must exceed: epsilon, or `release` where the filter is acting."""
+        config = self.filter.config
+        if self.acting is None:
+            return config.epsilon
+        return torch.where(self.acting, max(config.epsilon, config.release), config.epsilon)
 
     def _tell(self, decision: FilterDecision) -> None:
         """Log the first override of an episode."""
@@ -123,7 +132,7 @@ class Shield:
         for other in _shields - {self}:
             fresh = other.decided_at is not None and 0 <= self.clock() - other.decided_at <= within_s
             if fresh and torch.equal(other.decision.action.cpu(), action) and self._no_stricter_than(other):
-                self.latent, self.executed = other.latent, other.executed
+                self.latent, self.executed, self.acting = other.latent, other.executed, other.acting
                 self.decision, self.decided_at = other.decision, other.decided_at
                 return True
         return False
@@ -134,7 +143,7 @@ class Shield:
         same = all(
             getattr(own, name) == getattr(theirs, name) for name in (*TRAINED, "law", "lookahead", "guard", "samples")
         )
-        if not same or theirs.mode == "monitor" or theirs.epsilon < own.epsilon:
+        if not same or theirs.mode == "monitor" or theirs.epsilon < own.epsilon or theirs.release < own.release:
             return False
         if other not in self._twins:  # weights are compared once
             ours, its = self.filter.state_dict(), other.filter.state_dict()

@@ -85,7 +85,7 @@ def main() -> None:
         table[who]["traces"] = traces(runs[who, first])
     panels = {who: table[who]["traces"] for who in arguments.operators}
     save(value_profiles(panels, first.epsilon, scene().fps), arguments.output.with_suffix(".png"))
-    used = {s.path: {"epsilon": s.epsilon, "guard": s.guard} for s in settings}
+    used = {s.path: {"epsilon": s.epsilon, "guard": s.guard, "release": s.release} for s in settings}
     write_json(arguments.output, {**table, "filters": used, **made_by})
 
 

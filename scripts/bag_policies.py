@@ -107,7 +107,7 @@ def main() -> None:
         for setting in settings:
             print(f"{who}, {setting.law} of {setting.path}: {in_short(laws[setting.law][setting.path])}")
     draw(table, arguments.laws[0], arguments.output.with_name("severity.png"))
-    used = {s.path: {"epsilon": s.epsilon, "guard": s.guard} for s in settings}
+    used = {s.path: {"epsilon": s.epsilon, "guard": s.guard, "release": s.release} for s in settings}
     write_json(arguments.output, {**table, "filters": used, **made_by})
     for who in bases:
         for seed in range(FIRST_SEED, FIRST_SEED + arguments.n_videos):

@@ -498,5 +498,8 @@ def test_fallback_moves_only_the_commands_it_may(cache_meta):
     assert (both.critic.high > both.critic.low).tolist() == [True, False]  # the speed never varies
     none = tiny.new_policy(cache_meta, action_candidates=None, fallback_moves=["speed.vel"])
     assert not (none.critic.high > none.critic.low).any()
+    one_way = tiny.new_policy(cache_meta, action_candidates=None, fallback_moves=["-turn_rate.vel"]).critic
+    assert (one_way.low.tolist(), one_way.high.tolist()) == ([-1, 0], [0, 0])
+    assert one_way.held_actions().tolist() == [[0, 0], [-1, 0]]
     with pytest.raises(ValueError, match=r"no action is named lift; there are turn_rate\.vel"):
         tiny.new_policy(cache_meta, action_candidates=None, fallback_moves=["lift"])

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import pytest
 import tiny
@@ -279,6 +280,24 @@ def test_guard_of_one_is_the_papers_law_and_more_steps_look_further(strict):
         margins.append(least)
     assert not torch.allclose(*latents)
     assert (margins[1] <= margins[0]).all()  # what happens on the way counts
+
+
+def test_once_the_filter_acts_the_policy_is_released_above_another_value(permissive):
+    config, shield = permissive.config, permissive.shield
+    value = shield(along(1)[0], actions(LEFT)).value
+    config.release = value.min().item() - 1e-3
+    for acting, release in ((False, 1.0), (True, value.min().item() - 1e-3), (True, value.max().item() + 1e-3)):
+        shield.reset()
+        config.release, shield.acting = release, torch.full((3,), acting)
+        assert (shield(along(1)[0], actions(LEFT)).intervened == (release > value) & acting).all()
+        assert torch.equal(shield.acting, shield.decision.intervened)
+    shield.reset()
+    assert shield.acting is None
+
+
+def test_a_release_that_is_never_reached_is_refused(policy):
+    with pytest.raises(ValueError, match=r"--policy.release is 1.0; expected less than 1"):
+        replace(policy.config, release=1.0)
 
 
 def test_continuous_fallback_stays_in_range(tiny_continuous_filter):

@@ -42,28 +42,31 @@ class FilterSetting:
     law: str
     epsilon: float
     guard: int
+    release: float
     fingerprint: str
 
     @classmethod
-    def of(cls, path: str, law: str, epsilon: float | None = None, guard: int | None = None) -> "FilterSetting":
-        """Epsilon and guard are the filter's own unless given."""
+    def of(
+        cls, path: str, law: str, epsilon: float | None = None, guard: int | None = None, release: float | None = None
+    ) -> "FilterSetting":  # fmt: skip
+        """Epsilon, guard and release are the filter's own unless given."""
         own = read_config(resolve_checkpoint(path))
         epsilon, guard = own.epsilon if epsilon is None else epsilon, own.guard if guard is None else guard
-        return cls(path, law, epsilon, guard, fingerprint(path))
+        return cls(path, law, epsilon, guard, own.release if release is None else release, fingerprint(path))
 
     @classmethod
     def all(cls, paths: list[str], laws: list[str], options: object) -> list["FilterSetting"]:
         """Filters under the first law, and the first of them under the others, which are what it is compared with.
 
-        Epsilon and guard are those of a command line's options.
+        Epsilon, guard and release are those of a command line's options.
         """
         pairs = [(path, laws[0]) for path in paths] + [(paths[0], law) for law in laws[1:]]
-        return [cls.of(path, law, options.epsilon, options.guard) for path, law in pairs]
+        return [cls.of(path, law, options.epsilon, options.guard, options.release) for path, law in pairs]
 
     def load(self, base: str | None = None) -> LatentSafePolicy:
         """The filter, with the policy it is to shield, if any."""
         policy = LatentSafePolicy.from_pretrained(self.path).eval()
-        policy.config.override(self, "law", "epsilon", "guard")
+        policy.config.override(self, "law", "epsilon", "guard", "release")
         if base is not None:
             policy.attach(base)
         return policy
@@ -75,6 +78,7 @@ def add_filter_options(parser: ArgumentParser, n: int) -> None:
     parser.add_argument("--n", type=int, default=n)
     parser.add_argument("--epsilon", type=float)
     parser.add_argument("--guard", type=int)
+    parser.add_argument("--release", type=float)
     parser.add_argument("--workers", type=int, default=1, help="processes")
 
 
