@@ -262,8 +262,7 @@ def look_ahead(
 
     The policies hold one action each; given a critic, its fallback policy is one more, and its value stands for all
     that comes after the horizon. Each outcome is a lower bound of V in the imagined world, up to the error of that
-    last value. With horizon 0 and a critic this is min(l, max_a Q). Which is best is a matter of what is to come: a
-    failure that is there already would make all of them equal.
+    last value. With horizon 0 and a critic this is min(l, max_a Q).
 
     Args:
         latent: N latents.
@@ -279,8 +278,7 @@ def look_ahead(
     now = imagination.margin(latent)
     n, n_policies = len(now), len(held) + (critic is not None)
     z = map_latent(latent, lambda t: t.repeat(n_policies, *[1] * (t.dim() - 1)))
-    worst = torch.full((n * n_policies,), torch.inf, device=now.device)
-    over = torch.zeros_like(worst, dtype=torch.bool)
+    worst, over = now.repeat(n_policies), torch.zeros(n * n_policies, dtype=torch.bool, device=now.device)
     action = first = held.repeat_interleave(n, 0)
     for t in range(horizon):
         if critic is not None:
@@ -295,8 +293,7 @@ def look_ahead(
         after = critic.value(imagination.features(z), imagination.margin(z))
         worst = torch.where(over, worst, torch.minimum(worst, after))
     best = worst.view(n_policies, n).max(0)
-    action = first.view(n_policies, n, -1)[best.indices, torch.arange(n, device=now.device)]
-    return torch.minimum(now, best.values), action
+    return best.values, first.view(n_policies, n, -1)[best.indices, torch.arange(n, device=now.device)]
 
 
 def discount(progress: float, config: ReachabilityConfig) -> float:
