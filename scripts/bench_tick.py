@@ -36,10 +36,11 @@ def shielded(path: str, base: str, ahead: int) -> LatentSafePolicy:
 def episode(policy: LatentSafePolicy, scene: BagScene, steps: int, alone: bool) -> list[float]:
     """Wall seconds of each tick; a tick begins no sooner than a period after the last."""
     policy.reset()
-    period, ticks, still = 1 / scene.fps, [], policy.hold_action(1)
-    for _ in range(steps):
+    period, ticks, moving = 1 / scene.fps, [], policy.hold_action(1)
+    for i in range(steps):
+        moving[0, 2] = 0.005 * np.cos(i)  # up and down, for a picture that repeats itself is not encoded again
         seen, began = observe(scene), time.perf_counter()
-        action = policy.shield(seen, still).action if alone else policy.select_action(seen)
+        action = policy.shield(seen, moving).action if alone else policy.select_action(seen)
         ticks.append(time.perf_counter() - began)
         scene.step(action[0].double().numpy())
         time.sleep(max(0.0, period - (time.perf_counter() - began)))
