@@ -61,7 +61,8 @@ class LatentSafePolicy(PreTrainedPolicy):
                 "--policy.type=latentsafe --dataset.repo_id=..., or load one with --policy.path=..."
             )
         config.validate_features()
-        named = (*config.kept_commands, *(name.lstrip("+-") for name in config.fallback_moves or []))
+        moved = (name[1:] if name.startswith(("+", "-")) else name for name in config.fallback_moves or [])
+        named = (*config.kept_commands, *moved)
         unknown = [name for name in named if name not in config.action_names]
         if unknown:
             raise ValueError(f"no action is named {', '.join(unknown)}; there are {', '.join(config.action_names)}")

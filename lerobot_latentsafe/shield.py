@@ -50,7 +50,6 @@ class Shield:
         """Forget the history: call at the start of every episode."""
         self.latent: Latent | None = None
         self.executed: Tensor | None = None
-        self.acting: Tensor | None = None  # bool (B,), whether the filter did at the last tick
         self.decision: FilterDecision | None = None
         self.decided_at: float | None = None
         self._told = False
@@ -98,10 +97,14 @@ class Shield:
             proposed, fallback, value, margin, self._threshold(), fault, monitor=config.mode == "monitor"
         )
         self.latent, self.decision, self.decided_at = latent, decision, finished
-        self.acting = decision.intervened
         self.executed = model.normalise_action(decision.action).nan_to_num(0.0).clamp(-1, 1)
         self._tell(decision)
         return decision
+
+    @property
+    def acting(self) -> Tensor | None:
+        """Whether the filter acted at the last tick: bool (B,); None before the first."""
+        return None if self.decision is None else self.decision.intervened
 
     def _threshold(self) -> float | Tensor:
         """What V must exceed: epsilon, or `release` where the filter is acting."""
@@ -132,7 +135,7 @@ class Shield:
         for other in _shields - {self}:
             fresh = other.decided_at is not None and 0 <= self.clock() - other.decided_at <= within_s
             if fresh and torch.equal(other.decision.action.cpu(), action) and self._no_stricter_than(other):
-                self.latent, self.executed, self.acting = other.latent, other.executed, other.acting
+                self.latent, self.executed = other.latent, other.executed
                 self.decision, self.decided_at = other.decision, other.decided_at
                 return True
         return False

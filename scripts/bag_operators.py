@@ -25,6 +25,7 @@ from lerobot_latentsafe.evaluation.bag import (
     as_job,
     drive,
     in_short,
+    in_use,
     run_cells,
     tabulate,
     traces,
@@ -85,8 +86,7 @@ def main() -> None:
         table[who]["traces"] = traces(runs[who, first])
     panels = {who: table[who]["traces"] for who in arguments.operators}
     save(value_profiles(panels, first.epsilon, scene().fps), arguments.output.with_suffix(".png"))
-    used = {s.path: {"epsilon": s.epsilon, "guard": s.guard, "release": s.release} for s in settings}
-    write_json(arguments.output, {**table, "filters": used, **made_by})
+    write_json(arguments.output, {**table, "filters": in_use(settings), **made_by})
 
 
 if __name__ == "__main__":

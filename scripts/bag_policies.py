@@ -26,6 +26,7 @@ from lerobot_latentsafe.evaluation.bag import (
     drive,
     fingerprint,
     in_short,
+    in_use,
     run_cells,
     tabulate,
 )
@@ -107,8 +108,7 @@ def main() -> None:
         for setting in settings:
             print(f"{who}, {setting.law} of {setting.path}: {in_short(laws[setting.law][setting.path])}")
     draw(table, arguments.laws[0], arguments.output.with_name("severity.png"))
-    used = {s.path: {"epsilon": s.epsilon, "guard": s.guard, "release": s.release} for s in settings}
-    write_json(arguments.output, {**table, "filters": used, **made_by})
+    write_json(arguments.output, {**table, "filters": in_use(settings), **made_by})
     for who in bases:
         for seed in range(FIRST_SEED, FIRST_SEED + arguments.n_videos):
             bare, shielded = ({**cells[who, setting], "seed": seed} for setting in (None, settings[0]))

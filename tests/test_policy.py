@@ -503,3 +503,5 @@ def test_fallback_moves_only_the_commands_it_may(cache_meta):
     assert one_way.held_actions().tolist() == [[0, 0], [-1, 0]]
     with pytest.raises(ValueError, match=r"no action is named lift; there are turn_rate\.vel"):
         tiny.new_policy(cache_meta, action_candidates=None, fallback_moves=["lift"])
+    with pytest.raises(ValueError, match=r"no action is named -turn_rate\.vel"):
+        tiny.new_policy(cache_meta, action_candidates=None, fallback_moves=["--turn_rate.vel"])

@@ -284,20 +284,21 @@ def test_guard_of_one_is_the_papers_law_and_more_steps_look_further(strict):
 
 def test_once_the_filter_acts_the_policy_is_released_above_another_value(permissive):
     config, shield = permissive.config, permissive.shield
-    value = shield(along(1)[0], actions(LEFT)).value
-    config.release = value.min().item() - 1e-3
+    first = shield(along(1)[0], actions(LEFT))
+    value = first.value
     for acting, release in ((False, 1.0), (True, value.min().item() - 1e-3), (True, value.max().item() + 1e-3)):
         shield.reset()
-        config.release, shield.acting = release, torch.full((3,), acting)
+        config.release, shield.decision = release, replace(first, intervened=torch.full((3,), acting))
         assert (shield(along(1)[0], actions(LEFT)).intervened == (release > value) & acting).all()
         assert torch.equal(shield.acting, shield.decision.intervened)
     shield.reset()
     assert shield.acting is None
 
 
-def test_a_release_that_is_never_reached_is_refused(policy):
-    with pytest.raises(ValueError, match=r"--policy.release is 1.0; expected less than 1"):
-        replace(policy.config, release=1.0)
+@pytest.mark.parametrize("release", [1.0, math.nan])
+def test_a_release_that_is_never_reached_is_refused(policy, release):
+    with pytest.raises(ValueError, match=rf"--policy.release is {release}; expected less than 1"):
+        replace(policy.config, release=release)
 
 
 def test_continuous_fallback_stays_in_range(tiny_continuous_filter):

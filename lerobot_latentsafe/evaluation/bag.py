@@ -90,6 +90,11 @@ def add_laws(parser: ArgumentParser) -> None:
     )  # fmt: skip
 
 
+def in_use(settings: list[FilterSetting]) -> dict[str, dict]:
+    """Path -> what a table notes of a filter beside its rates."""
+    return {s.path: {"epsilon": s.epsilon, "guard": s.guard, "release": s.release} for s in settings}
+
+
 def as_job(setting: FilterSetting | None) -> dict | None:
     """As a part of a job; back by `FilterSetting(**...)`."""
     return asdict(setting) if setting else None
