@@ -277,6 +277,7 @@ class Wrap:
     base_policy_path: str | None = None
     epsilon: float | None = None
     guard: int | None = None
+    release: float | None = None
     law: str | None = None
     mode: str | None = None
     half: bool = False
@@ -288,7 +289,7 @@ class Wrap:
 
         refuse_existing(self.output_dir)
         policy = LatentSafePolicy.from_pretrained(self.policy.path)
-        policy.config.override(self, "epsilon", "guard", "law", "mode")
+        policy.config.override(self, "epsilon", "guard", "release", "law", "mode")
         if self.base_policy_path:
             policy.attach(self.base_policy_path)
         save_filter(policy, self.output_dir, half=self.half)
@@ -387,6 +388,7 @@ class EvalShield:
     seed: int = 0
     epsilon: float | None = None
     guard: int | None = None
+    release: float | None = None
     law: str | None = None
     """These override the filter's."""
     json: Path | None = None
@@ -404,7 +406,7 @@ class EvalShield:
         if self.n_episodes < 1:
             raise ValueError(f"--n_episodes is {self.n_episodes}; expected at least 1")
         policy = LatentSafePolicy.from_pretrained(self.policy.path)
-        policy.config.override(self, "epsilon", "guard", "law")
+        policy.config.override(self, "epsilon", "guard", "release", "law")
         if self.base_policy_path:
             policy.attach(self.base_policy_path)
         result = compare(policy, self.env, self.n_episodes, self.seed, self.n_videos if self.video else 0)
@@ -413,6 +415,7 @@ class EvalShield:
             **result,
             "epsilon": policy.config.epsilon,
             "guard": policy.config.guard,
+            "release": policy.config.release,
             "law": policy.config.law,
             **provenance(seeds=[self.seed]),
         }
@@ -598,6 +601,7 @@ class Report:
     seed: int = 0
     epsilon: float | None = None
     guard: int | None = None
+    release: float | None = None
     law: str | None = None
     """These override the filter's."""
 
@@ -611,7 +615,7 @@ class Report:
         if self.base_policy_path and self.env is None:
             raise ValueError("--base_policy_path runs a policy, but where? Give --env.type")
         policy = LatentSafePolicy.from_pretrained(self.policy.path).eval()
-        policy.config.override(self, "epsilon", "guard", "law")
+        policy.config.override(self, "epsilon", "guard", "release", "law")
         if self.base_policy_path:
             policy.attach(self.base_policy_path)
         recorded = DatasetFrames(self.dataset.downloaded()) if self.dataset.repo_id else None

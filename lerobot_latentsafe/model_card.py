@@ -38,7 +38,7 @@ outside of what its data covered.
 | failure specification | `{failure}` |
 | stage | {stage} |
 | law | {law} |
-| epsilon | {epsilon:g} |
+| epsilon | {epsilon} |
 | epsilon was set | {calibration} |
 | shields | {base} |
 
@@ -129,7 +129,7 @@ def make_model_card(
             failure=config.failure_specification,
             stage=config.stage,
             law=f"{config.law}, V read after {config.guard} + {config.lookahead} imagined steps",
-            epsilon=config.epsilon,
+            epsilon=threshold(config),
             calibration=_calibration(config.calibration),
             base=f"`{config.base_policy_path}`" if config.base_policy_path else "nothing yet",
             repo_id=config.repo_id or "me/filter",
@@ -138,6 +138,13 @@ def make_model_card(
             evaluation=_evaluation(config.evaluation),
         )
     )
+
+
+def threshold(config: LatentSafeConfig) -> str:
+    """What V must exceed, in words."""
+    if config.release <= config.epsilon:
+        return f"{config.epsilon:g}"
+    return f"{config.epsilon:g}; once the filter acts, {config.release:g}"
 
 
 def _world_model(config: LatentSafeConfig) -> str:

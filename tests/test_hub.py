@@ -135,6 +135,12 @@ def test_card_admits_an_epsilon_set_by_hand(policy):
     assert "| epsilon was set | by hand |" in card.text
 
 
+def test_card_says_above_what_the_base_policy_is_released(policy):
+    policy.config.epsilon, policy.config.release = 0.4, 0.5
+    card = policy.generate_model_card("me/car", "latentsafe", None, None)
+    assert "| epsilon | 0.4; once the filter acts, 0.5 |" in card.text
+
+
 def test_unknown_id_is_a_clear_error(hub):
     with pytest.raises(CheckpointError, match=r"(?s)could not get me/nothing.*Check the id"):
         LatentSafePolicy.from_pretrained("me/nothing")

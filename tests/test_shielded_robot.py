@@ -287,6 +287,14 @@ def test_a_filter_of_another_robot_is_refused_before_anything_moves(tmp_path, ch
         make_robot_from_config(config(other))
 
 
+def test_once_it_acted_the_robot_is_released_above_another_value(trained):
+    with make_robot_from_config(config(trained, epsilon=ALWAYS, release=0.9)) as robot:
+        robot.send_action(PUSH)
+        robot.filter.config.epsilon = NEVER
+        robot.send_action(PUSH)
+        assert last(robot).intervened.item() == (last(robot).value.item() <= 0.9)
+
+
 def test_options_out_of_range_are_refused(trained):
     with pytest.raises(ValueError, match="guard"):
         make_robot_from_config(config(trained, guard=99))

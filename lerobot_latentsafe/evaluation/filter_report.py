@@ -14,6 +14,7 @@ from lerobot_latentsafe.evaluation.rollouts import provenance, wilson
 from lerobot_latentsafe.evaluation.shielding import Episodes, check_environment, compare, count_reasons
 from lerobot_latentsafe.filter import Reason
 from lerobot_latentsafe.labeling.frames import DatasetFrames
+from lerobot_latentsafe.model_card import threshold
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.world_models.base import Latent
 
@@ -98,7 +99,7 @@ def _about(policy: LatentSafePolicy) -> list[str]:
         ["acts on", ", ".join(f"{name} from {low:.3g} to {high:.3g}" for name, low, high in ranges)],
         ["rate", f"{config.fps} steps a second"],
         ["failure means", f"the recordings' label {config.failure_specification!r}"],
-        ["threshold", f"epsilon = {config.epsilon:g}, {evidence}"],
+        ["threshold", f"epsilon = {threshold(config)}, {evidence}"],
         ["mode", "overrides unsafe actions" if config.mode == "filter" else "only watches"],
     ]
     return [report.heading("The filter"), report.table(["", ""], rows)]

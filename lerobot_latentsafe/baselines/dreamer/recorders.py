@@ -14,7 +14,7 @@ from lerobot_latentsafe.checkpoint import read_config
 from lerobot_latentsafe.datasets.collect_franka import SOURCES
 from lerobot_latentsafe.envs.franka_env import BlocksEnv
 from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES
-from lerobot_latentsafe.teleoperators.scripted.behaviors import Actions, begin
+from lerobot_latentsafe.teleoperators.scripted.behaviors import Actions, begin, jostled
 
 Job = tuple[int, Path | None]
 """An episode's number, and the folder of the policy that acts in it; None: a scripted operator does."""
@@ -38,7 +38,8 @@ class Recorder:
         episode, folder = job
         if folder is None:
             rng = np.random.default_rng([self.seed, episode])
-            operator = _Scripted(begin(self.source.behavior(episode), self.env.scene, None, rng))
+            actions = begin(self.source.behavior(episode), self.env.scene, None, rng)
+            operator = _Scripted(jostled(self.env.scene, actions, rng))
         else:
             operator = self._exploring(folder)
             torch.manual_seed(number(self.seed, 1, episode))

@@ -190,8 +190,9 @@ class DreamerTraining:
             optimizer.zero_grad(set_to_none=True)
         policy, clip = self.policy, Clip(dict(zip(CAMERA_KEYS, (front, wrist))), *rest)
         loss, features, metrics = policy.model_loss(clip, reward)
-        features = features.detach()
+        # Cloning shapes the latents, too: the few pixels that tell where to grasp weigh little in the images' error.
         cloning_loss = policy.cloning_loss(features, clip.action, clip.valid & demonstrated[:, None])
+        features = features.detach()
         start = policy.model.world_model.latent_of(features.flatten(0, 1)[starts], clip.action.flatten(0, 1)[starts])
         actor_loss, critic_loss, imagined = policy.behavior_losses(start)
         (loss + critic_loss + weights[0] * actor_loss + weights[1] * cloning_loss).backward()

@@ -49,7 +49,7 @@ class LatentSafeShielded(Robot):
         self.inner = make_robot_from_config(config.inner)
         self.name = self.robot_type = self.inner.name
         self.filter = LatentSafePolicy.from_pretrained(config.filter).eval()
-        self.filter.config.override(config, "mode", "epsilon", "guard")
+        self.filter.config.override(config, "mode", "epsilon", "guard", "release")
         if config.device:
             self.filter.to(config.device)
         self.filter.require_stage(self.filter.needed_stage)

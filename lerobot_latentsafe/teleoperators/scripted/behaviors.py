@@ -171,6 +171,15 @@ def unsteady(scene: FrankaScene, actions: Actions, rng: np.random.Generator) -> 
         yield np.clip(np.array([*(action[:3] + off), *action[3:6], gripper]), low, high)
 
 
+def jostled(scene: FrankaScene, actions: Actions, rng: np.random.Generator) -> Actions:
+    """Pushed aside now and then while the fingers are open, so that a learner sees how to come back."""
+    low, high = action_limits(scene.fps)
+    for action in actions:
+        pushed = action[6] > 0.5 and rng.random() < 0.15
+        off = rng.normal(0, 0.006, 3) if pushed else np.zeros(3)
+        yield np.clip(np.array([*(action[:3] + off), *action[3:]]), low, high)
+
+
 def clumsy(scene: bag.BagScene, speed: float, rng: np.random.Generator) -> Actions:
     """Grasp the bag somewhere, not well, and lift it."""
     segment = int(rng.choice(bag.SEGMENTS, p=HELD_ANYWHERE))
