@@ -20,6 +20,7 @@ from lerobot_latentsafe.baselines.dreamer.replay import CAMERA_KEYS, Replay
 from lerobot_latentsafe.baselines.dreamer.training import DreamerTraining, TrainDreamer
 from lerobot_latentsafe.checkpoint import CheckpointError
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, UntrainedFilterError
+from lerobot_latentsafe.robots.franka_interface import STATE_NAMES
 from lerobot_latentsafe.shield import BasePolicy
 from lerobot_latentsafe.training import halve_weights, train_reachability
 
@@ -60,6 +61,19 @@ def test_actions_that_are_drawn_far_out_of_range_are_executed_and_remembered_cli
     action = task_policy.act(observation(), explore=True)
     torch.testing.assert_close(task_policy.executed, torch.ones(2, 7))
     torch.testing.assert_close(action, task_policy.model.denormalise_action(torch.ones(2, 7)))
+
+
+def test_at_the_first_frame_it_knows_what_its_fingers_do(task_policy, monkeypatch):
+    model, seen = task_policy.model, []
+    observe = model.world_model.observe
+    monkeypatch.setattr(model.world_model, "observe", lambda *args: seen.append(args[1]) or observe(*args))
+    for opening in (0.0, 1.0):
+        batch = observation()
+        batch["observation.state"][:, STATE_NAMES.index("gripper.pos")] = opening
+        task_policy.reset()
+        task_policy.select_action(batch)
+    closed, opened = seen[0], seen[2]  # it looks twice
+    assert (closed[:, -1] == -1).all() and (opened[:, -1] == 1).all() and not closed[:, :-1].any()
 
 
 # Training
@@ -161,7 +175,7 @@ def test_rewards_are_those_of_the_frames(trained):
 def test_demonstrations_are_the_scripted_operators(trained):
     replay = DreamerTraining(tiny.dreamer_options(trained)).replay
     speed = 20 * np.linalg.norm(replay.arrays["action"][: tiny.BLOCKS_FRAMES, :3], axis=1)
-    assert speed.max() == pytest.approx(0.3, abs=1e-3)  # on the way to the blocks
+    assert np.isclose(speed, 0.3, atol=1e-3).any()  # on the way to the blocks, unless pushed
     assert replay.written.all()
 
 

@@ -156,6 +156,14 @@ def test_the_clumsy_grasp_off_centre_and_open_their_fingers_now_and_then(bag_sce
     assert ((actions >= low) & (actions <= high)).all()
 
 
+def test_a_jostled_hand_is_pushed_only_while_its_fingers_are_open(blocks_scene):
+    steps = [np.array([0.005, 0, 0, 0, 0, 0, grip]) for grip in (1.0, 0.0) for _ in range(200)]
+    actions = np.array([*behaviors.jostled(blocks_scene, iter(steps), np.random.default_rng(0))])
+    pushed = (actions != np.array(steps)).any(1)
+    assert 0.1 < pushed[:200].mean() < 0.2 and not pushed[200:].any()
+    assert (np.abs(actions) <= behaviors.action_limits(blocks_scene.fps)[1]).all()
+
+
 def reach_of(actions, scene):
     """Where the hand is after each action."""
     for action in actions:

@@ -79,6 +79,8 @@ class LatentSafeDreamerPolicy(PreTrainedPolicy):
         percepts = model.world_model.perceive(images)
         state = model.normalise_state(batch["observation.state"].to(model.device))
         first = self.latent is None
+        if first:  # what the fingers do is known of every frame that was learned from, so it must be of this one
+            self.executed = model.first_action(model.normalise_action(model.commands_seen(state)).nan_to_num(0.0))
         self.latent = model.world_model.observe(self.latent, self.executed, percepts, state)
         features = model.world_model.features(self.latent)
         self.executed = self.actor.sample(features).clamp(-1, 1) if explore else self.actor.mode(features)
