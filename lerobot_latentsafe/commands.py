@@ -282,6 +282,8 @@ class Wrap:
     mode: str | None = None
     half: bool = False
     """Store weights in 16 bits."""
+    drawing: bool = True
+    """Keep what draws an RSSM's imagination for reports, two fifths of its weights."""
 
     def run(self) -> None:
         from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
@@ -290,6 +292,10 @@ class Wrap:
         refuse_existing(self.output_dir)
         policy = LatentSafePolicy.from_pretrained(self.policy.path)
         policy.config.override(self, "epsilon", "guard", "release", "law", "mode")
+        if not self.drawing:
+            if not policy.world_model.draws:
+                raise ValueError(f"--drawing=false, but the {policy.config.world_model.type} world model draws nothing")
+            policy.world_model.stop_drawing()
         if self.base_policy_path:
             policy.attach(self.base_policy_path)
         save_filter(policy, self.output_dir, half=self.half)

@@ -3,6 +3,7 @@ import json
 import numpy as np
 import pytest
 import tiny
+import torch
 
 from lerobot_latentsafe import checkpoint
 from lerobot_latentsafe.cli import VERBS, main
@@ -171,6 +172,19 @@ def test_wrap_writes_one_folder(tiny_filter, tiny_diffusion, tmp_path):
     )  # fmt: skip
     policy = LatentSafePolicy.from_pretrained(tmp_path / "wrapped")
     assert (policy.config.epsilon, policy.config.mode, policy.base.config.type) == (0.125, "monitor", "diffusion")
+
+
+def test_wrap_can_leave_out_what_draws(capsys, tiny_filter, tmp_path):
+    from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+
+    main(["wrap", f"--policy.path={tiny_filter}", "--drawing=false", f"--output_dir={tmp_path / 'small'}"])
+    small, whole = (LatentSafePolicy.from_pretrained(p) for p in (tmp_path / "small", tiny_filter))
+    weights = small.state_dict()
+    assert all(torch.equal(weights[k], v) for k, v in whole.state_dict().items() if "decoders" not in k)
+    assert whole.world_model.draws and not small.world_model.draws
+    of_tokens = tiny.save_franka_filter(tmp_path / "tokens", world_model=tiny.gru_config())
+    options = [f"--policy.path={of_tokens}", "--drawing=false", f"--output_dir={tmp_path / 'w'}"]
+    assert "the gru world model draws nothing" in fails(capsys, "wrap", *options)
 
 
 def test_wrap_refuses_an_unknown_mode(capsys, tiny_filter, tmp_path):

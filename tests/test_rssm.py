@@ -50,6 +50,19 @@ def test_loss_decreases_on_one_batch():
     assert losses[-1] < 0.9 * losses[0]
 
 
+def test_without_its_decoders_it_imagines_the_same_but_neither_draws_nor_learns(model):
+    clip = tiny.random_clip(batch=2, length=4)
+    before = model.encode(clip)
+    assert model.draws
+    model.stop_drawing()
+    assert_same(model.encode(clip), before)
+    assert not model.draws and not any("decoders" in name for name, _ in model.named_parameters())
+    error = model.error(map_latent(before, lambda t: t[:, 0]), {KEY: clip.percepts[KEY][:, 1]}, clip.state[:, 1])
+    assert error.shape == (2,) and (error > 0).all()
+    with pytest.raises(ValueError, match="decoder is false.*train the one that it was wrapped from"):
+        model.loss(clip)
+
+
 def test_every_parameter_learns_but_the_continuation_until_ends_are_known():
     model = tiny.rssm_config(free_nats=0.0).build([KEY], 2, tiny.ACTION_DIM).train()
     clip = tiny.random_clip(batch=2, length=6)

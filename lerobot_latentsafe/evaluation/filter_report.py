@@ -49,7 +49,7 @@ def write_filter_report(
             f"{recorded.meta.repo_id} was not recorded under a filter (latentsafe record), so nothing tells what one "
             "changed; record under it, give --env.type as well, or ask latentsafe check-labels what it thinks of these"
         )
-    album = None if hasattr(policy.world_model, "decode") else Album(policy)
+    album = None if policy.world_model.draws else Album(policy)
     if album is not None and recorded is not None:
         album.add_dataset(recorded)
     with TemporaryDirectory() as folder:

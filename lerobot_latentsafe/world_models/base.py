@@ -110,6 +110,11 @@ class WorldModel(nn.Module, abc.ABC):
         return self.step(latent, action)
 
     @property
+    def draws(self) -> bool:
+        """Whether it shows a latent's features as pictures, by `decode`."""
+        return False
+
+    @property
     def percept_names(self) -> list[str]:
         """Keys of what `perceive` returns."""
         return self.image_keys

@@ -36,6 +36,7 @@ class RSSMConfig(WorldModelConfig):
         free_nats, dynamics_scale, representation_scale: KL balancing as in DreamerV3.
         image_scale: weight of the squared image error, summed over pixels. 16 makes a 32 x 32 image weigh
             what the same picture weighs at 128 x 128.
+        decoder: whether it can draw what it imagines. It learns by drawing; a filter at work need not draw.
     """
 
     image_size: int = 32
@@ -56,6 +57,7 @@ class RSSMConfig(WorldModelConfig):
     dynamics_scale: float = 0.5
     representation_scale: float = 0.1
     image_scale: float = 16.0
+    decoder: bool = True
 
     def build(self, image_keys: list[str], state_dim: int, action_dim: int) -> "RSSM":
         return RSSM(self, image_keys, state_dim, action_dim)
@@ -162,7 +164,8 @@ class RSSM(EndAware):
         self.cameras = {key: key.replace(".", "_") for key in self.image_keys}
         shape = (3, config.image_size, config.image_size)
         self.encoders = nn.ModuleDict({name: _ImageEncoder(config) for name in self.cameras.values()})
-        self.decoders = nn.ModuleDict({name: _ImageDecoder(config, self.feature_dim) for name in self.cameras.values()})
+        drawn = self.cameras.values() if config.decoder else ()
+        self.decoders = nn.ModuleDict({name: _ImageDecoder(config, self.feature_dim) for name in drawn})
         for name in self.cameras.values():
             self.register_buffer(f"mean_{name}", torch.zeros(shape))
         self.register_buffer("mean_count", torch.zeros(()))
@@ -214,7 +217,18 @@ class RSSM(EndAware):
         x, h = features.split([self.stochastic.dim, self.config.deterministic], -1)
         return {"h": h, "x": x, "action": action}
 
+    @property
+    def draws(self) -> bool:
+        return self.config.decoder
+
+    def stop_drawing(self) -> None:
+        """Forget the decoders: what is left is smaller, and learns no more."""
+        self.decoders, self.config.decoder = nn.ModuleDict(), False
+
     def error(self, latent: Latent, percepts: dict[str, Tensor], state: Tensor) -> Tensor:
+        if not self.draws:
+            seen = self.features(self.correct(latent, percepts, state))
+            return (self.features(latent) - seen).square().mean(-1)
         decoded = self.decode(self.features(latent))
         return sum((decoded[key] - percepts[key]).square().mean((1, 2, 3)) for key in self.image_keys)
 
@@ -248,7 +262,16 @@ class RSSM(EndAware):
     # -- learning ---
 
     def loss(self, clip: Clip) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-        """Reconstruction + balanced KL + continuation; samples x so that the model is trained as a distribution."""
+        """Reconstruction + balanced KL + continuation; samples x so that the model is trained as a distribution.
+
+        Raises:
+            ValueError: it was stored without its decoders.
+        """
+        if not self.draws:
+            raise ValueError(
+                "this world model was stored without what draws its imagination (world_model.decoder is false), and "
+                "cannot learn; train the one that it was wrapped from"
+            )
         if self.training:
             self._update_mean_image(clip)
         batch, length = clip.state.shape[:2]
