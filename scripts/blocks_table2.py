@@ -15,7 +15,15 @@ import numpy as np
 
 from lerobot_latentsafe.envs.scenes import SCENES
 from lerobot_latentsafe.evaluation.bag import fingerprint
-from lerobot_latentsafe.evaluation.blocks_study import lead, leads, run, run_filmed, trade_off, unsafe_rollout
+from lerobot_latentsafe.evaluation.blocks_study import (
+    lead,
+    leads,
+    run,
+    run_filmed,
+    trade_off,
+    unsafe_rollout,
+    world_model_of,
+)
 from lerobot_latentsafe.evaluation.figures import save
 from lerobot_latentsafe.evaluation.rollouts import paired_p_value, provenance, run_resumable, wilson, write_json
 
@@ -77,9 +85,10 @@ def main() -> None:
     parser.add_argument("--output_dir", type=Path, default=Path("results/blocks"))
     arguments = parser.parse_args()
     dreamer, filters, risks = arguments.dreamer, arguments.filters, arguments.risks
+    world_model = world_model_of(dreamer)
 
     def jobs(n: int, first: int, mode: str, path: str | None = None, epsilon: float | None = None) -> list[dict]:
-        made_of = [fingerprint(p) for p in (dreamer, f"{dreamer}/world_model", path) if p]
+        made_of = [fingerprint(p) for p in (dreamer, world_model, path) if p]
         job = {"dreamer": dreamer, "filter": path, "mode": mode, "epsilon": epsilon, "made_of": made_of}
         return [{**job, "seed": seed} for seed in range(first, first + n)]
 

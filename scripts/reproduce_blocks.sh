@@ -28,9 +28,12 @@ fi
       [ -e "$OUT/$target/seed_$seed/integrity.json" ] || $BIN/latentsafe train-reachability --seeds="[$seed]" \
         --policy.path="$OUT/dreamer/policy/world_model" --dataset.repo_id=local/blocks_dreamer \
         --dataset.root="$OUT/dreamer/episodes" --output_dir="$OUT/$target/seed_$seed" --target=$target $critic
+      # What is committed has 16 bits and no decoders; blocks is the first filter.
+      [ -e "$OUT/$target/final_$seed" ] || $BIN/latentsafe wrap --policy.path="$OUT/$target/seed_$seed" \
+        --output_dir="$OUT/$target/final_$seed" --half=true --drawing=false
     done
   done
 
-  $BIN/python scripts/blocks_table2.py --dreamer "$OUT/dreamer/policy" --filters "$OUT"/reachability/seed_{0,1,2} \
-    --risks "$OUT"/risk/seed_{0,1,2} --cells "$OUT/cells.jsonl" --workers="${WORKERS:-1}" $table
+  $BIN/python scripts/blocks_table2.py --dreamer "$OUT/dreamer/policy" --filters "$OUT"/reachability/final_{0,1,2} \
+    --risks "$OUT"/risk/final_{0,1,2} --cells "$OUT/cells.jsonl" --workers="${WORKERS:-1}" $table
 }

@@ -59,7 +59,7 @@ def test_without_its_decoders_it_imagines_the_same_but_neither_draws_nor_learns(
     assert not model.draws and not any("decoders" in name for name, _ in model.named_parameters())
     error = model.error(map_latent(before, lambda t: t[:, 0]), {KEY: clip.percepts[KEY][:, 1]}, clip.state[:, 1])
     assert error.shape == (2,) and (error > 0).all()
-    with pytest.raises(ValueError, match="decoder is false.*train the one that it was wrapped from"):
+    with pytest.raises(ValueError, match=r"decoder is false.*train the one that it was wrapped from"):
         model.loss(clip)
 
 

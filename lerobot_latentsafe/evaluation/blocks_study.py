@@ -40,6 +40,13 @@ def load(dreamer: str, filter: str | None, mode: str, epsilon: float | None) -> 
     return policy
 
 
+def world_model_of(dreamer: str) -> str:
+    """Path of a task policy's world model: its own folder, or that of another checkpoint which it shares."""
+    folder = resolve_checkpoint(dreamer)
+    path = read_config(folder).world_model_path
+    return str(folder / path) if (folder / path).exists() else path
+
+
 def run(job: dict) -> dict:
     """One episode; the job holds seed, mode, and what `load` takes.
 
