@@ -148,12 +148,16 @@ def test_all_parts_learn(trained, tmp_path):
     assert moved == {"world_model", "margin"}
 
 
-def test_batches_hold_a_tenth_of_demonstrations(trained):
+def test_batches_hold_demonstrations_by_their_share_of_episodes_and_a_least_share(trained):
     run = DreamerTraining(tiny.dreamer_options(trained))
     run.step, run.options.batch_size = 5, 20
+    share = run.options.demonstrations / run.n_episodes
+    assert run.options.demonstration_share < share < 1
+    assert run._batch()[1].sum() == round(20 * share)
+    run.options.demonstration_share = 0.9
     reward, demonstrated, starts, weights, *clip = run._batch()
     valid = clip[5]
-    assert demonstrated.sum() == 2 and reward.shape == valid.shape == (20, 6)
+    assert demonstrated.sum() == 18 and reward.shape == valid.shape == (20, 6)
     assert valid.flatten()[starts].all() and weights.tolist() == pytest.approx([1.0, 0.1])
     run.step = 2  # before the policy has episodes
     _, demonstrated, _, weights, *_ = run._batch()

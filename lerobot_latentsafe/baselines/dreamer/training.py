@@ -66,7 +66,7 @@ class TrainDreamer:
     batch_size: int = 20
     """Clips of a step."""
     demonstration_share: float = 0.1
-    """Of a batch, once there are episodes of the policy."""
+    """Of a batch, at least; more while they are a larger share of all episodes."""
     save_every: int = 1000
     log_every: int = 100
     seed: int = 0
@@ -222,9 +222,9 @@ class DreamerTraining:
         rng = np.random.default_rng([options.seed, self.step])
         reader = self.replay.reader(self.n_episodes, policy.model.config.world_model.clip_length)
         n_frames, n_demonstrated = len(reader.labels.failure), options.demonstrations * self.replay.length
-        n = options.batch_size
-        if n_frames > n_demonstrated:
-            n = max(1, round(options.demonstration_share * options.batch_size))
+        # A few episodes of the policy would be learned by heart if they made up most of a batch.
+        share = max(options.demonstration_share, n_demonstrated / n_frames)
+        n = max(1, round(share * options.batch_size))
         demonstrated = np.arange(options.batch_size) < n
         first = np.where(
             demonstrated,
