@@ -63,6 +63,24 @@ def test_actions_that_are_drawn_far_out_of_range_are_executed_and_remembered_cli
     torch.testing.assert_close(action, task_policy.model.denormalise_action(torch.ones(2, 7)))
 
 
+def test_a_hand_that_is_led_astray_goes_there_for_some_steps_and_the_policy_remembers(task_policy):
+    def acts(rng):
+        torch.manual_seed(0)
+        explore = recorders._Exploring(task_policy, rng)
+        for t in range(60):
+            action = torch.from_numpy(explore(observation(1, seed=t)))
+            torch.testing.assert_close(task_policy.model.denormalise_action(task_policy.executed), action)
+            yield explore.left, action
+
+    left, action = zip(*acts(np.random.default_rng(1)))
+    _, alone = zip(*acts(None))
+    begun = next(t for t in range(60) if left[t])
+    assert torch.equal(torch.cat(action[:begun]), torch.cat(alone[:begun]))
+    led = torch.cat(action[begun : begun + left[begun] + 1])
+    assert 2 <= len(led) <= 6 and torch.equal(led[:, :3], led[:1, :3].expand(len(led), 3))
+    assert not torch.equal(led[0, :3], alone[begun][0, :3])
+
+
 def test_at_the_first_frame_it_knows_what_its_fingers_do(task_policy, monkeypatch):
     model, seen = task_policy.model, []
     observe = model.world_model.observe

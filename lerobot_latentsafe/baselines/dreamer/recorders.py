@@ -16,6 +16,8 @@ from lerobot_latentsafe.envs.franka_env import BlocksEnv
 from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES
 from lerobot_latentsafe.teleoperators.scripted.behaviors import Actions, begin, jostled
 
+STRAYING = 3
+"""In one of so many of the policy's episodes the hand is led astray."""
 Job = tuple[int, Path | None]
 """An episode's number, and the folder of the policy that acts in it; None: a scripted operator does."""
 
@@ -41,17 +43,17 @@ class Recorder:
             actions = begin(self.source.behavior(episode), self.env.scene, None, rng)
             operator = _Scripted(jostled(self.env.scene, actions, rng))
         else:
-            operator = self._exploring(folder)
             torch.manual_seed(number(self.seed, 1, episode))
+            rng = np.random.default_rng([self.seed, 1, episode]) if episode % STRAYING == 0 else None
+            operator = _Exploring(self._policy(folder), rng)
         return record([self.env], [1_000_000 * self.seed + episode], operator, self.image_size)[0]
 
-    def _exploring(self, folder: Path):
+    def _policy(self, folder: Path) -> LatentSafeDreamerPolicy:
         if folder != self.folder:
             config = read_config(folder)
             config.device = "cpu"
             self.policy, self.folder = LatentSafeDreamerPolicy.from_pretrained(folder, config=config).eval(), folder
-        self.policy.reset()
-        return lambda batch: self.policy.act(batch, explore=True).numpy()
+        return self.policy
 
 
 class Recorders:
@@ -89,6 +91,33 @@ class _Scripted:
     def __call__(self, batch: dict[str, Tensor]) -> np.ndarray:
         self.last = next(self.operator, np.append(np.zeros(6), self.last[6]))
         return self.last[None]
+
+
+class _Exploring:
+    """The policy, exploring.
+
+    Args:
+        rng: its hand is led astray now and then, at up to full speed for some steps, as a filter's fallback will do;
+            None: it is not.
+    """
+
+    def __init__(self, policy: LatentSafeDreamerPolicy, rng: np.random.Generator | None):
+        policy.reset()
+        self.policy, self.rng, self.left, self.move = policy, rng, 0, torch.zeros(3)
+
+    def __call__(self, batch: dict[str, Tensor]) -> np.ndarray:
+        action = self.policy.act(batch, explore=True)
+        if self.rng is not None:
+            if self.left == 0 and self.rng.random() < 0.06:
+                move = self.rng.uniform(-1, 1, 3)
+                self.left = int(self.rng.integers(2, 7))
+                self.move = torch.from_numpy(move / np.abs(move).max() * self.rng.choice([0.5, 1.0])).float()
+            if self.left > 0:
+                self.left -= 1
+                low, high = self.policy.model.action_low[:3], self.policy.model.action_high[:3]
+                action[:, :3] = (low + (self.move + 1) / 2 * (high - low)).cpu()
+                self.policy.was_overridden(action)
+        return action.cpu().numpy()
 
 
 def _start(seed: int, image_size: int) -> None:
