@@ -502,7 +502,8 @@ class LatentReachability:
             future = self.target.q(x).gather(-1, choice).squeeze(-1)
         else:
             future = self.target.best_q(x)
-        target = self.critic.backup(l, torch.where(ended, torch.inf, future), gamma)
+        # No margin is below -1: a Q that is would draw all others after it.
+        target = self.critic.backup(l, torch.where(ended, torch.inf, future.clamp(min=-1)), gamma)
         if self.imagination.sampled or self.critic.backup is not safety_bellman_target:
             return target  # what was achieved once bounds neither what is drawn again nor a probability
         beyond = torch.where(batch["end_over"], torch.inf, self.target.best_q(batch["end_x"]))
