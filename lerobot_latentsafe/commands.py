@@ -155,6 +155,8 @@ class EvalWorldModel:
     dataset: DatasetSource = field(default_factory=DatasetSource)
     n_episodes: int = 200
     """Episodes used at most, the last ones of the dataset."""
+    horizon: int = 30
+    """Steps of an episode that are imagined; what fails later counts as safe."""
     seed: int = 0
     json: Path | None = None
 
@@ -165,9 +167,15 @@ class EvalWorldModel:
         from lerobot_latentsafe.evaluation.world_model import evaluate_world_model
         from lerobot_latentsafe.training import load_with_cache
 
+        if self.horizon < 1:
+            raise ValueError(f"--horizon is {self.horizon}; expected at least 1 step")
         policy, reader = load_with_cache(self.policy.path, self.dataset.metadata(), self.seed)
         episodes = np.unique(reader.labels.episode)[-self.n_episodes :]
-        row = evaluate_world_model(policy, reader, episodes, self.seed)
+        row = evaluate_world_model(policy, reader, episodes, self.seed, horizon=self.horizon)
+        if row["episodes"]["failing"] == 0:
+            print(
+                f"no episode fails within --horizon={self.horizon} steps: nothing says whether failures are foreseen"
+            )
         for part, numbers in row.items():
             for name, number in numbers.items():
                 print(f"{part:9s} {name:18s} {_short(number)}")

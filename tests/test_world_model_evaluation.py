@@ -48,9 +48,15 @@ def test_alarmist_has_the_balanced_accuracy_of_chance(policy):
     with torch.no_grad():
         policy.margin.net[-1].weight.zero_()
         policy.margin.net[-1].bias.fill_(-1.0)
-    row = questions.imagined_episodes(policy, policy.reader, episodes(policy), torch.Generator().manual_seed(0))
+    row = questions.imagined_episodes(policy, policy.reader, episodes(policy), torch.Generator().manual_seed(0), 30)
     assert row["verdicts"] == 0.5 and row["false_alarms"]["k"] == row["safe"]
     assert row["hold_false_alarms"]["k"] == row["failing"] + row["safe"]
+
+
+def test_what_fails_after_the_horizon_counts_as_safe(policy):
+    ask = lambda steps: evaluate_world_model(policy, policy.reader, episodes(policy), n_windows=8, horizon=steps)  # noqa: E731
+    soon, later = ask(1)["episodes"], ask(30)["episodes"]
+    assert soon["failing"] < later["failing"] and sum(soon[k] - later[k] for k in ("failing", "safe")) == 0
 
 
 def test_balanced_accuracy_needs_both_classes():

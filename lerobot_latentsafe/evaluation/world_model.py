@@ -21,21 +21,23 @@ OBSERVED = 4
 
 
 def evaluate_world_model(
-    policy: LatentSafePolicy, reader: ClipReader, episodes: np.ndarray, seed: int = 0, n_windows: int = 1024
-) -> dict:
+    policy: LatentSafePolicy, reader: ClipReader, episodes: np.ndarray, seed: int = 0, n_windows: int = 1024,
+    horizon: int = 30,
+) -> dict:  # fmt: skip
     """Every number of `latentsafe eval-world-model`, on held-out episodes.
 
     Args:
         reader: of a cached dataset.
-        episodes: their indices; each is also imagined whole, from its first frame.
+        episodes: their indices; each is also imagined from its first frame.
         n_windows: random windows within them, for the errors.
+        horizon: steps of an episode that are imagined.
     """
     generator = torch.Generator().manual_seed(seed)
     policy.eval()
     return {
         "errors": prediction_errors(policy, reader, episodes, n_windows, generator),
         "margin": margin_quality(policy, reader, episodes, n_windows, generator),
-        "episodes": imagined_episodes(policy, reader, episodes, generator),
+        "episodes": imagined_episodes(policy, reader, episodes, generator, horizon),
     }
 
 
@@ -89,7 +91,7 @@ def margin_quality(
 
 @torch.no_grad()
 def imagined_episodes(
-    policy: LatentSafePolicy, reader: ClipReader, episodes: np.ndarray, generator: torch.Generator, horizon: int = 30
+    policy: LatentSafePolicy, reader: ClipReader, episodes: np.ndarray, generator: torch.Generator, horizon: int
 ) -> dict:
     """Imagine the recorded actions of each episode from its first frame alone, and compare with what happened.
 
