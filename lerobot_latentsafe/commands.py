@@ -173,9 +173,7 @@ class EvalWorldModel:
         episodes = np.unique(reader.labels.episode)[-self.n_episodes :]
         row = evaluate_world_model(policy, reader, episodes, self.seed, horizon=self.horizon)
         if row["episodes"]["failing"] == 0:
-            print(
-                f"no episode fails within --horizon={self.horizon} steps: nothing says whether failures are foreseen"
-            )
+            print(f"no episode fails within --horizon={self.horizon} steps: nothing says whether failures are foreseen")
         for part, numbers in row.items():
             for name, number in numbers.items():
                 print(f"{part:9s} {name:18s} {_short(number)}")

@@ -200,12 +200,11 @@ class DreamerTraining:
         return {name: value.detach() for name, value in metrics.items()}
 
     def _descend(self, name: str) -> None:
-        """A gradient step; step sizes rise over the first 100 steps and fall over the second half."""
-        options, optimizer = self.options, self.optimizers[name]
-        decay = min(1.0, (self.step + 1) / 100, 2.05 - 2 * self.step / options.steps)
+        """A gradient step; step sizes rise over the first 100 steps, and stay, so that a run begins like any longer one."""
+        optimizer, rise = self.optimizers[name], min(1.0, (self.step + 1) / 100)
         parameters = []
         for group, lr in zip(optimizer.param_groups, self.step_sizes[name]):
-            group["lr"] = lr * decay
+            group["lr"] = lr * rise
             parameters += group["params"]
         torch.nn.utils.clip_grad_norm_(parameters, self.policy.model.config.grad_clip_norm)
         optimizer.step()
