@@ -200,7 +200,7 @@ class DreamerTraining:
         return {name: value.detach() for name, value in metrics.items()}
 
     def _descend(self, name: str) -> None:
-        """A gradient step; step sizes rise over the first 100 steps, and stay, so that a run begins like any longer one."""
+        """A gradient step; step sizes rise over 100 steps and stay, so that a run begins like any longer one."""
         optimizer, rise = self.optimizers[name], min(1.0, (self.step + 1) / 100)
         parameters = []
         for group, lr in zip(optimizer.param_groups, self.step_sizes[name]):
