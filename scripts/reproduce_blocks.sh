@@ -28,7 +28,7 @@ fi
       [ -e "$OUT/$target/seed_$seed/integrity.json" ] || $BIN/latentsafe train-reachability --seeds="[$seed]" \
         --policy.path="$OUT/dreamer/policy/world_model" --dataset.repo_id=local/blocks_dreamer \
         --dataset.root="$OUT/dreamer/episodes" --output_dir="$OUT/$target/seed_$seed" --target=$target $critic
-      # What is committed has 16 bits and no decoders; blocks is the first filter.
+      # As filters are committed: 16 bits, no decoders.
       [ -e "$OUT/$target/final_$seed" ] || $BIN/latentsafe wrap --policy.path="$OUT/$target/seed_$seed" \
         --output_dir="$OUT/$target/final_$seed" --half=true --drawing=false
     done

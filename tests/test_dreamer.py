@@ -19,6 +19,7 @@ from lerobot_latentsafe.baselines.dreamer.modeling_dreamer import LatentSafeDrea
 from lerobot_latentsafe.baselines.dreamer.replay import CAMERA_KEYS, Replay
 from lerobot_latentsafe.baselines.dreamer.training import DreamerTraining, TrainDreamer
 from lerobot_latentsafe.checkpoint import CheckpointError
+from lerobot_latentsafe.evaluation.blocks_study import world_model_of
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, UntrainedFilterError
 from lerobot_latentsafe.robots.franka_interface import STATE_NAMES
 from lerobot_latentsafe.shield import BasePolicy
@@ -194,10 +195,13 @@ def test_rewards_are_those_of_the_frames(trained):
         assert (windows - kept).abs().amax(1).min() < 1e-6
 
 
-def test_demonstrations_are_the_scripted_operators(trained):
+def test_demonstrations_are_the_scripted_operators_pushed_now_and_then(trained, monkeypatch):
     replay = DreamerTraining(tiny.dreamer_options(trained)).replay
-    speed = 20 * np.linalg.norm(replay.arrays["action"][: tiny.BLOCKS_FRAMES, :3], axis=1)
-    assert np.isclose(speed, 0.3, atol=1e-3).any()  # on the way to the blocks, unless pushed
+    monkeypatch.setattr(recorders, "jostled", lambda scene, actions, rng: actions)
+    unpushed = recorders.Recorder(0, 16)((0, None))["action"]
+    speed = 20 * np.linalg.norm(unpushed[:, :3], axis=1)
+    assert speed.max() == pytest.approx(0.3, abs=1e-3)  # on the way to the blocks
+    assert (replay.arrays["action"][: tiny.BLOCKS_FRAMES] != unpushed).any()
     assert replay.written.all()
 
 
@@ -230,6 +234,21 @@ def test_loaded_policy_acts_as_the_saved_one(task_policy, tmp_path):
     actions = drive(LatentSafeDreamerPolicy.from_pretrained(tmp_path / "copy"))
     torch.testing.assert_close(actions, drive(task_policy), rtol=0, atol=0)
     assert actions.shape == (3, 2, 7) and task_policy.config.world_model_path != "world_model"
+
+
+def test_a_policy_may_share_the_world_model_of_another_checkpoint(task_policy, trained, tmp_path):
+    shared = tmp_path / "shared"
+    shutil.copytree(trained / "policy", shared)
+    (shared / "world_model").rename(tmp_path / "filter")
+    config = json.loads((shared / "config.json").read_text())
+    for path in ("no/such/filter", str(tmp_path / "filter")):
+        (shared / "config.json").write_text(json.dumps({**config, "world_model_path": path}))
+        assert world_model_of(str(shared)) == path
+        if path.startswith("no"):
+            with pytest.raises(CheckpointError, match="no checkpoint at no/such/filter"):
+                LatentSafeDreamerPolicy.from_pretrained(shared)
+    torch.testing.assert_close(drive(LatentSafeDreamerPolicy.from_pretrained(shared)), drive(task_policy))
+    assert world_model_of(str(trained / "policy")) == str(trained / "policy/world_model")
 
 
 def test_lerobot_makes_it_by_its_type(trained):

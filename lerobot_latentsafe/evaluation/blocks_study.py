@@ -11,6 +11,7 @@ import torch
 from lerobot.envs import preprocess_observation
 from matplotlib.figure import Figure
 
+from lerobot_latentsafe.baselines.dreamer.modeling_dreamer import stored_world_model
 from lerobot_latentsafe.baselines.simulator import SimulatorLookahead
 from lerobot_latentsafe.checkpoint import read_config, resolve_checkpoint
 from lerobot_latentsafe.envs.configuration_envs import LatentSafeBlocksEnv
@@ -41,10 +42,9 @@ def load(dreamer: str, filter: str | None, mode: str, epsilon: float | None) -> 
 
 
 def world_model_of(dreamer: str) -> str:
-    """Path of a task policy's world model: its own folder, or that of another checkpoint which it shares."""
+    """Path of a stored task policy's world model."""
     folder = resolve_checkpoint(dreamer)
-    path = read_config(folder).world_model_path
-    return str(folder / path) if (folder / path).exists() else path
+    return stored_world_model(folder, read_config(folder))
 
 
 def run(job: dict) -> dict:

@@ -172,8 +172,7 @@ class LatentSafeDreamerPolicy(PreTrainedPolicy):
         config = config or read_config(folder)
         if not isinstance(config, LatentSafeDreamerConfig):
             raise CheckpointError(f"{pretrained_name_or_path} is a {config.type!r} policy, expected latentsafe_dreamer")
-        if config.world_model_path == WORLD_MODEL_FOLDER:
-            config.world_model_path = str(folder / WORLD_MODEL_FOLDER)
+        config.world_model_path = stored_world_model(folder, config)
         with fitting_weights(folder):
             return super().from_pretrained(folder, config=config, strict=True, **kwargs)
 
@@ -183,6 +182,12 @@ class LatentSafeDreamerPolicy(PreTrainedPolicy):
         from lerobot_latentsafe.model_card import make_task_policy_card
 
         return make_task_policy_card(self.config, dataset_repo_id, license, tags)
+
+
+def stored_world_model(folder: Path, config: LatentSafeDreamerConfig) -> str | None:
+    """Path of the world model of a policy stored in a folder: beside it, or that of a checkpoint which it shares."""
+    path = config.world_model_path
+    return str(folder / path) if path == WORLD_MODEL_FOLDER else path
 
 
 def _load_world_model(config: LatentSafeDreamerConfig) -> LatentSafePolicy:

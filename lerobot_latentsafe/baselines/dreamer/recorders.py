@@ -114,8 +114,9 @@ class _Exploring:
                 self.move = torch.from_numpy(move / np.abs(move).max() * self.rng.choice([0.5, 1.0])).float()
             if self.left > 0:
                 self.left -= 1
-                low, high = self.policy.model.action_low[:3], self.policy.model.action_high[:3]
-                action[:, :3] = (low + (self.move + 1) / 2 * (high - low)).cpu()
+                moved = self.policy.executed.clone()
+                moved[:, :3] = self.move
+                action = self.policy.model.denormalise_action(moved)
                 self.policy.was_overridden(action)
         return action.cpu().numpy()
 

@@ -50,7 +50,7 @@ class TrainDreamer:
     repo_id: str = "local/blocks_dreamer"
     """Of the dataset that is written."""
     demonstrations: int = 200
-    """Episodes of the scripted operators of the source blocks_demos."""
+    """Episodes of the scripted operators of the source blocks_demos, pushed aside now and then."""
     pretraining: int = 2000
     """Steps on demonstrations alone: world model, margin and cloning."""
     steps: int = 10_000
