@@ -198,6 +198,16 @@ def test_a_careful_pluck_succeeds_and_a_careless_one_fells_a_block(blocks_scene)
     assert last["failure"] and last["margin"] < 0 and last["tilt"] > 1
 
 
+def test_a_block_on_the_way_to_the_tray_fells_its_neighbour_only_if_the_way_is_flat(blocks_scene):
+    away = {}
+    for seed in range(20):
+        blocks_scene.reset(seed)
+        away[seed] = blocks_scene.block_position("green")[1] - behaviors.TRAY[1]
+    for seed, fells in ((min(away, key=away.get), False), (max(away, key=away.get), True)):
+        truths = [*play(blocks_scene, "fetch", seed, steps=60)]
+        assert any(truth["lifted"] for truth in truths) and truths[-1]["failure"] == fells
+
+
 def test_a_slightly_tilted_block_falls_back(blocks_scene):
     for tilt, falls in ((0.15, False), (0.4, True)):
         blocks_scene.reset(0)

@@ -16,7 +16,7 @@ from lerobot_latentsafe.envs.franka_env import BlocksEnv
 from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES
 from lerobot_latentsafe.teleoperators.scripted.behaviors import Actions, begin, jostled
 
-STRAYING = 3
+STRAYING = 2
 """In one of so many of the policy's episodes the hand is led astray."""
 Job = tuple[int, Path | None]
 """An episode's number, and the folder of the policy that acts in it; None: a scripted operator does."""

@@ -198,6 +198,11 @@ def rise(scene: bag.BagScene, speed: float) -> Actions:
 
 # The blocks
 
+PARTED = 0.72
+"""Of the fingers, with 3.5 mm to spare on either side of the green block."""
+TRAY = np.array([0.48, -0.10, 0.50])
+"""Above where the green block is wanted, m."""
+
 
 def pluck(scene: blocks.BlocksScene, slip: float, drift: float, speed: float, rng: np.random.Generator) -> Actions:
     """Put the fingers between the blocks and pull the green one up.
@@ -205,21 +210,35 @@ def pluck(scene: blocks.BlocksScene, slip: float, drift: float, speed: float, rn
     `slip` is how far off centre the fingers go in, and `drift` how far sideways the pull goes on its way up: standard
     deviations in metres.
     """
-    opening = 0.72  # 3.5 mm to spare on either side of the green block
     across = np.array([-np.sin(scene.yaw), np.cos(scene.yaw), 0])
     top = scene.block_position("green") + np.clip(rng.normal(0, slip), -0.008, 0.008) * across
-    yield from reach(scene, np.append(top[:2], 0.27), MAX_SPEED, opening, scene.yaw)
-    yield from reach(scene, np.append(top[:2], 0.20), speed, opening)
+    yield from reach(scene, np.append(top[:2], 0.27), MAX_SPEED, PARTED, scene.yaw)
+    yield from reach(scene, np.append(top[:2], 0.20), speed, PARTED)
     yield from hold(CLOSED, 5)
     sideways = rng.choice([-1, 1]) * abs(rng.normal(drift, drift / 3)) * across
     yield from reach(scene, scene.controller.position + up(0.12) + sideways, speed, CLOSED)
     yield from hold(CLOSED, 60)
 
 
+def fetch(scene: blocks.BlocksScene, speed: float, rng: np.random.Generator) -> Actions:
+    """Pluck the green block on a straight line to the tray: the further away it stands, the flatter the pull.
+
+    Pauses of any length keep a learner from closing the fingers by the clock.
+    """
+    top = scene.block_position("green") + rng.normal(0, 0.001, 3)
+    yield from hold(PARTED, int(rng.integers(4)))
+    yield from reach(scene, np.append(top[:2], 0.27), MAX_SPEED, PARTED, scene.yaw)
+    yield from hold(PARTED, int(rng.integers(6)))
+    yield from reach(scene, np.append(top[:2], 0.20), speed, PARTED)
+    yield from hold(CLOSED, 5)
+    yield from reach(scene, TRAY, speed, CLOSED)
+    yield from hold(CLOSED, 60)
+
+
 def play(scene: blocks.BlocksScene, speed: float, rng: np.random.Generator) -> Actions:
     """Go above the blocks, then Gaussian actions."""
     top = scene.block_position("green")[:2] + rng.normal(0, 0.03, 2)
-    yield from reach(scene, np.append(top, 0.24), MAX_SPEED, rng.choice([0.72, OPEN]), scene.yaw)
+    yield from reach(scene, np.append(top, 0.24), MAX_SPEED, rng.choice([PARTED, OPEN]), scene.yaw)
     yield from wander(scene, speed, rng)
 
 
@@ -247,6 +266,7 @@ BLOCKS: dict[str, tuple[Callable[..., Actions], tuple[float, float]]] = {
     "random": (play, (0.2, MAX_SPEED)),
     "pluck_careful": (lambda scene, speed, rng: pluck(scene, 0.001, 0.0, speed, rng), (0.15, 0.25)),
     "pluck_careless": (lambda scene, speed, rng: pluck(scene, 0.004, 0.08, speed, rng), (0.20, MAX_SPEED)),
+    "fetch": (fetch, (0.15, 0.25)),
 }
 """Name -> the behaviour and the range of its speed, m/s."""
 

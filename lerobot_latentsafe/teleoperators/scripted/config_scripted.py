@@ -17,6 +17,7 @@ BEHAVIORS = {
     "random": "Gaussian actions, around the bag from a random grasp, around the blocks from above",
     "pluck_careful": "pull the green block straight up",
     "pluck_careless": "pull the green block up and sideways, so that a red one falls",
+    "fetch": "pull the green block straight to the tray, which fells a red one from some starts",
 }
 
 
