@@ -14,7 +14,6 @@ OMP_NUM_THREADS=1 python scripts/measure_franka.py spills variants ...
 """
 
 import argparse
-import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -249,20 +248,14 @@ def recording(n: int) -> dict:
 
 
 def balance(n: int) -> dict:
-    """What each dataset recorded by scripts/collect_franka.sh holds; its first n episodes at most.
-
-    What an earlier measurement says of a dataset that is not in data/ stays.
-    """
+    """What each dataset recorded by scripts/collect_franka.sh holds; its first n episodes at most."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     from lerobot_latentsafe.datasets.collect_franka import SOURCES
     from lerobot_latentsafe.datasets.labels import FAILING
 
-    earlier = json.loads((OUT / "balance.json").read_text())
-    rows = {name: earlier[name] for name in SOURCES if name in earlier}
+    rows = {}
     for name in SOURCES:
-        if not (Path("data") / name).exists():
-            continue
         columns = LeRobotDataset(f"latentsafe/{name}", root=Path("data") / name).hf_dataset.with_format("numpy")
         episode = np.asarray(columns["episode_index"])
         kept = episode < n
