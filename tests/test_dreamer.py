@@ -21,7 +21,7 @@ from lerobot_latentsafe.baselines.dreamer.training import DreamerTraining, Train
 from lerobot_latentsafe.checkpoint import CheckpointError
 from lerobot_latentsafe.evaluation.blocks_study import world_model_of
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, UntrainedFilterError
-from lerobot_latentsafe.robots.franka_interface import STATE_NAMES
+from lerobot_latentsafe.robots.franka_interface import STATE_NAMES, action_limits
 from lerobot_latentsafe.shield import BasePolicy
 from lerobot_latentsafe.training import halve_weights, train_reachability
 
@@ -71,7 +71,7 @@ def test_a_hand_that_is_led_astray_goes_there_for_some_steps_and_the_policy_reme
         for t in range(60):
             action = torch.from_numpy(explore(observation(1, seed=t)))
             torch.testing.assert_close(task_policy.model.denormalise_action(task_policy.executed), action)
-            yield explore.left, action
+            yield explore.straying and explore.straying.left, action
 
     left, action = zip(*acts(np.random.default_rng(1)))
     _, alone = zip(*acts(None))
@@ -172,21 +172,21 @@ def test_batches_hold_demonstrations_by_their_share_of_episodes_and_a_least_shar
     run.step, run.options.batch_size = 5, 20
     share = run.options.demonstrations / run.n_episodes
     assert run.options.demonstration_share < share < 1
-    assert run._batch()[1].sum() == round(20 * share)
+    assert run._batch()[2].sum() == round(20 * share)
     run.options.demonstration_share = 0.9
-    reward, demonstrated, starts, weights, *clip = run._batch()
+    reward, _, demonstrated, starts, weights, *clip = run._batch()
     valid = clip[5]
     assert demonstrated.sum() == 18 and reward.shape == valid.shape == (20, 6)
     assert valid.flatten()[starts].all() and weights.tolist() == pytest.approx([1.0, 0.1])
     run.step = 2  # before the policy has episodes
-    _, demonstrated, _, weights, *_ = run._batch()
+    _, _, demonstrated, _, weights, *_ = run._batch()
     assert demonstrated.all() and weights.tolist() == [0.0, 1.0]
 
 
 def test_rewards_are_those_of_the_frames(trained):
     run = DreamerTraining(tiny.dreamer_options(trained))
     run.step = 0
-    reward, _, _, _, *clip = run._batch()
+    reward, _, _, _, _, *clip = run._batch()
     terms = run.replay.arrays["terms"]
     every = run.policy.config.behavior.rewards.reward(torch.from_numpy(terms[: 2 * tiny.BLOCKS_FRAMES]))
     for row, valid in zip(reward, clip[5]):
@@ -195,14 +195,39 @@ def test_rewards_are_those_of_the_frames(trained):
         assert (windows - kept).abs().amax(1).min() < 1e-6
 
 
-def test_demonstrations_are_the_scripted_operators_pushed_now_and_then(trained, monkeypatch):
+def test_demonstrations_show_what_the_operator_meant_beside_what_a_jostled_hand_did(trained):
     replay = DreamerTraining(tiny.dreamer_options(trained)).replay
-    monkeypatch.setattr(recorders, "jostled", lambda scene, actions, rng: actions)
-    unpushed = recorders.Recorder(0, 16)((0, None))["action"]
-    speed = 20 * np.linalg.norm(unpushed[:, :3], axis=1)
+    n = 2 * tiny.BLOCKS_FRAMES
+    meant, done = replay.arrays["meant"][:n], replay.arrays["action"][:n]
+    speed = 20 * np.linalg.norm(meant[:, :3], axis=1)
     assert speed.max() == pytest.approx(0.3, abs=1e-3)  # on the way to the blocks
-    assert (replay.arrays["action"][: tiny.BLOCKS_FRAMES] != unpushed).any()
-    assert replay.written.all()
+    assert 0 < (meant != done).any(1).mean() < 0.5 and replay.written.all()
+
+
+def test_a_hand_is_led_astray_at_up_to_full_speed_and_jostled_only_while_its_fingers_are_open():
+    steps = [np.array([0.002, 0, 0, 0, 0, 0, grip]) for grip in (1.0, 0.0) for _ in range(400)]
+    low, high = action_limits(20)
+    operator = recorders._Scripted(iter(steps), 20, np.random.default_rng(0))
+    done = np.array([operator({})[0] for _ in steps])
+    astray = np.isclose(np.abs(done[:, :3]).max(1) / high[0], 1, atol=1e-6)
+    moved, closed = (done[:, :3] != np.array(steps)[:, :3]).any(1), done[:400, 6] == 0
+    assert 0.02 < astray.mean() < 0.2 and 0.01 < closed.mean() < 0.2
+    assert 0.2 < moved[:400].mean() < 0.45 and 0.05 < moved[400:].mean() < 0.3
+    assert ((done >= low) & (done <= high)).all()
+
+
+def test_what_was_meant_is_imitated_not_what_was_done(trained):
+    run = DreamerTraining(tiny.dreamer_options(trained))
+    run.step = 0
+    _, meant, *_ = run._batch()
+    every = run.policy.model.normalise_action(torch.from_numpy(np.array(run.replay.arrays["meant"]))).clamp(-1, 1)
+    for row in meant:
+        windows = every.unfold(0, 3, 1)  # (N, A, 3)
+        assert (windows - row[:3].T).abs().amax((1, 2)).min() < 1e-6
+    features = torch.zeros(*meant.shape[:2], run.policy.model.world_model.feature_dim)
+    known = torch.ones(meant.shape[:2], dtype=torch.bool)
+    loss = run.policy.cloning_loss(features, meant, known).item()
+    assert loss == pytest.approx(-run.policy.actor.log_prob(features, meant).mean().item(), rel=1e-5)
 
 
 def test_replay_of_another_size_is_refused(tmp_path):

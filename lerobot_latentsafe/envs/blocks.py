@@ -1,7 +1,7 @@
 """The paper's plucking task: take the green block from between two red ones without felling a red one.
 
 Blocks are 5 x 5 x 20 cm and 0.5 kg, 7 cm apart, on a low base. Touching, pushing and tilting a red block is allowed;
-one tilted by more than 1 rad is a failure. A block tilts back by itself from less than atan(2.5 / 10) = 0.24 rad.
+one tilted by more than 1 rad is a failure. A block tilts back by itself from less than `POINT_OF_NO_RETURN`.
 """
 
 import numpy as np
@@ -17,15 +17,19 @@ BASE = 0.02
 MASS = 0.5
 MAX_TILT = 1.0
 """A red block tilted by more has fallen, rad."""
+POINT_OF_NO_RETURN = float(np.arctan2(HALF_WIDTH, HALF_HEIGHT))
+"""0.24 rad: a block tilted by more falls by itself, unless something holds it."""
 LIFTED = 0.20
 """The green block is plucked when its centre is higher, m."""
+HELD = 0.03
+"""The green block is between the fingers if they are so near to where one holds it, m."""
 NAMES = ("green", "red_left", "red_right")
 
 
 class BlocksScene(FrankaScene):
-    """Pluck the green block. Truth: tilt of the red blocks, whether one fell, whether the green one is lifted, and what
-    dense rewards are made of: `reach` in [0, 1], how near the fingers are to the green block's top, and `joint_speed`,
-    the sum of squares over the arm's joints, rad^2/s^2.
+    """Pluck the green block. Truth: tilt of the red blocks, whether one fell, whether the green one is lifted, whether
+    it is between the fingers, and what dense rewards are made of: `reach` in [0, 1], how near the fingers are to the
+    green block's top, and `joint_speed`, the sum of squares over the arm's joints, rad^2/s^2.
 
     Args:
         variant: standard.
@@ -80,6 +84,7 @@ class BlocksScene(FrankaScene):
             "is_success": lifted and not fallen,
             "tilt": tilt,
             "lifted": lifted,
+            "held": distance < HELD,
             "reach": reach,
             "joint_speed": joint_speed,
             "reward": reach + 20 * lifted - 10 * fallen - 1e-3 * joint_speed,

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from lerobot_latentsafe.baselines.dreamer.modeling_dreamer import stored_world_model
 from lerobot_latentsafe.baselines.simulator import SimulatorLookahead
 from lerobot_latentsafe.checkpoint import read_config, resolve_checkpoint
+from lerobot_latentsafe.envs.blocks import POINT_OF_NO_RETURN
 from lerobot_latentsafe.envs.configuration_envs import LatentSafeBlocksEnv
 from lerobot_latentsafe.envs.franka_env import BlocksEnv
 from lerobot_latentsafe.evaluation.shielding import check_environment
@@ -53,8 +54,9 @@ def run(job: dict) -> dict:
     Modes: bare; filter; lookahead, the filter that knows the simulator; monitor, in which a filter only looks on.
 
     Returns:
-        success, violation, steps, overridden; of a violation that was looked on at, also margin and value, l and V of
-        each step.
+        success, the block was picked up and no red one fell (the paper's); violation; held, it is up at the end;
+        leaning, the episode ended with a red block that has not fallen yet, but will; steps; overridden; of a violation
+        that was looked on at, also margin and value, l and V of each step.
     """
     return run_filmed(job)[0]
 
@@ -67,7 +69,7 @@ def run_filmed(job: dict) -> tuple[dict, list[np.ndarray]]:
     look_ahead = SimulatorLookahead(env.scene)
     observation, info = env.reset(seed=job["seed"])
     actor.reset()
-    frames, latents, overridden, truncated = [], [], 0, False
+    frames, latents, overridden, lifted, truncated = [], [], 0, False, False
     while not truncated:
         frames.append(observation["pixels"]["front"])
         batch = {**preprocess_observation(observation), "task": [env.task]}
@@ -84,7 +86,12 @@ def run_filmed(job: dict) -> tuple[dict, list[np.ndarray]]:
                 actor.replan(torch.from_numpy(action).float()[None])
         overridden += retreated
         observation, _, _, truncated, info = env.step(action)
-    row = {"success": info["is_success"], "violation": info["failure"], "steps": env.steps, "overridden": overridden}
+        lifted |= info["lifted"]
+    failed = info["failure"]
+    row = {
+        "success": lifted and not failed, "violation": failed, "held": info["is_success"],
+        "leaning": bool(info["tilt"] > POINT_OF_NO_RETURN) and not failed, "steps": env.steps, "overridden": overridden,
+    }  # fmt: skip
     if job["mode"] == "monitor" and info["failure"]:
         row |= {name: column.tolist() for name, column in zip(("margin", "value"), values_along(actor, latents))}
     return row, frames

@@ -116,13 +116,13 @@ class LatentSafeDreamerPolicy(PreTrainedPolicy):
         reward_loss = (self.reward.loss(features, reward) * clip.valid).sum() / clip.valid.sum()
         return loss + reward_loss, features, {**metrics, "loss_reward": reward_loss}
 
-    def cloning_loss(self, features: Tensor, action: Tensor, valid: Tensor) -> Tensor:
-        """Negative log density of the actions that were taken after each frame: ().
+    def cloning_loss(self, features: Tensor, meant: Tensor, known: Tensor) -> Tensor:
+        """Negative log density of the actions that an operator meant to take after each frame: ().
 
         Args:
-            features: (B, T, D); action: (B, T, A), that which led to each frame; valid: bool (B, T).
+            features: (B, T, D); meant: (B, T, A) in [-1, 1]; known: bool (B, T), frames after which there is one.
         """
-        known, surprise = valid[:, 1:], -self.actor.log_prob(features[:, :-1], action[:, 1:])
+        surprise = -self.actor.log_prob(features, meant)
         return (surprise * known).sum() / known.sum().clamp(min=1)
 
     def behavior_losses(self, start: Latent) -> tuple[Tensor, Tensor, dict[str, Tensor]]:

@@ -13,8 +13,8 @@ from lerobot_latentsafe.baselines.dreamer.replay import record
 from lerobot_latentsafe.checkpoint import read_config
 from lerobot_latentsafe.datasets.collect_franka import SOURCES
 from lerobot_latentsafe.envs.franka_env import BlocksEnv
-from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES
-from lerobot_latentsafe.teleoperators.scripted.behaviors import Actions, begin, jostled
+from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, action_limits
+from lerobot_latentsafe.teleoperators.scripted.behaviors import CLOSED, Actions, begin
 
 STRAYING = 2
 """In one of so many of the policy's episodes the hand is led astray."""
@@ -41,7 +41,7 @@ class Recorder:
         if folder is None:
             rng = np.random.default_rng([self.seed, episode])
             actions = begin(self.source.behavior(episode), self.env.scene, None, rng)
-            operator = _Scripted(jostled(self.env.scene, actions, rng))
+            operator = _Scripted(actions, self.env.scene.fps, rng)
         else:
             torch.manual_seed(number(self.seed, 1, episode))
             rng = np.random.default_rng([self.seed, 1, episode]) if episode % STRAYING == 0 else None
@@ -82,40 +82,76 @@ class Recorders:
             self.pool.join()
 
 
-class _Scripted:
-    """An operator of `teleoperators/scripted`; when it has finished it holds still."""
+class _Straying:
+    """Leads a hand astray now and then, for some steps at up to full speed, as a filter's fallback will do.
 
-    def __init__(self, operator: Actions):
-        self.operator, self.last = operator, np.zeros(len(ACTION_NAMES))
+    Attributes:
+        move: where to now, (3,) in [-1, 1]; None: nowhere.
+    """
+
+    def __init__(self, rng: np.random.Generator, rate: float):
+        self.rng, self.rate, self.left, self.move = rng, rate, 0, None
+
+    def advance(self) -> bool:
+        """Of a step: whether another move begins."""
+        begins = self.left == 0 and self.rng.random() < self.rate
+        if begins:
+            move = self.rng.uniform(-1, 1, 3)
+            self.left = int(self.rng.integers(2, 7))
+            self.move = move / np.abs(move).max() * self.rng.choice([0.5, 1.0])
+        elif self.left == 0:
+            self.move = None
+        self.left = max(0, self.left - 1)
+        return begins
+
+
+class _Scripted:
+    """An operator of `teleoperators/scripted`, whose hand does not always do what it means.
+
+    While its fingers are open it is jostled; at any time it may be led astray, and its fingers close with it in some of
+    these moves. So a learner sees how to come back. When the operator has finished it holds still.
+
+    Attributes:
+        meant: the action (1, 7) of this step before that.
+    """
+
+    def __init__(self, operator: Actions, fps: int, rng: np.random.Generator):
+        self.operator, self.rng, self.straying = operator, rng, _Straying(rng, 0.04)
+        self.limits, self.closing = action_limits(fps), False
+        self.meant = np.zeros((1, len(ACTION_NAMES)), np.float32)
 
     def __call__(self, batch: dict[str, Tensor]) -> np.ndarray:
-        self.last = next(self.operator, np.append(np.zeros(6), self.last[6]))
-        return self.last[None]
+        meant = next(self.operator, np.append(np.zeros(6), self.meant[0, 6]))
+        self.meant, done = meant[None].astype(np.float32), meant.copy()
+        if self.straying.advance():
+            self.closing = self.rng.random() < 0.4
+        if self.straying.move is not None:
+            done[:3] = self.straying.move * self.limits[1][:3]
+            done[6] = CLOSED if self.closing else done[6]
+        elif meant[6] > 0.5 and self.rng.random() < 0.15:
+            done[:3] += self.rng.normal(0, 0.006, 3)
+            done[5] += self.rng.normal(0, 0.05)
+        return np.clip(done, *self.limits)[None]
 
 
 class _Exploring:
     """The policy, exploring.
 
     Args:
-        rng: its hand is led astray now and then, at up to full speed for some steps, as a filter's fallback will do;
-            None: it is not.
+        rng: its hand is led astray now and then; None: it is not.
     """
 
     def __init__(self, policy: LatentSafeDreamerPolicy, rng: np.random.Generator | None):
         policy.reset()
-        self.policy, self.rng, self.left, self.move = policy, rng, 0, torch.zeros(3)
+        self.policy, self.straying = policy, rng and _Straying(rng, 0.06)
 
     def __call__(self, batch: dict[str, Tensor]) -> np.ndarray:
         action = self.policy.act(batch, explore=True)
-        if self.rng is not None:
-            if self.left == 0 and self.rng.random() < 0.06:
-                move = self.rng.uniform(-1, 1, 3)
-                self.left = int(self.rng.integers(2, 7))
-                self.move = torch.from_numpy(move / np.abs(move).max() * self.rng.choice([0.5, 1.0])).float()
-            if self.left > 0:
-                self.left -= 1
+        if self.straying is not None:
+            self.straying.advance()
+            if self.straying.move is not None:
                 moved = self.policy.executed.clone()
-                moved[:, :3] = self.move
+                moved[:, :3] = torch.from_numpy(self.straying.move).to(moved)
                 action = self.policy.model.denormalise_action(moved)
                 self.policy.was_overridden(action)
         return action.cpu().numpy()

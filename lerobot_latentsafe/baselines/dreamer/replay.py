@@ -22,14 +22,15 @@ from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFran
 
 CAMERA_KEYS = ("observation.images.front", "observation.images.wrist")
 Operator = Callable[[dict[str, torch.Tensor]], np.ndarray]
-"""Chooses actions (N, 7) in robot units from a LeRobot batch of observations."""
+"""Chooses actions (N, 7) in robot units from a LeRobot batch of observations. If it does something else than it meant,
+its attribute `meant` holds that."""
 
 
 def record(envs: list[FrankaEnv], seeds: list[int], operator: Operator, image_size: int) -> list[dict[str, np.ndarray]]:
     """One episode in each environment: arrays by name, a row a frame, as `Replay` stores them.
 
-    Frame t holds o_t, the action taken after it, whether the episode has failed by then, and the reward's terms of
-    arriving there.
+    Frame t holds o_t, the action taken after it, the one that was meant, whether the episode has failed by then, and
+    the reward's terms of arriving there.
     """
     observations, infos = zip(*[env.reset(seed=seed)[:2] for env, seed in zip(envs, seeds)])
     low, high = action_limits(envs[0].metadata["render_fps"])
@@ -45,6 +46,7 @@ def record(envs: list[FrankaEnv], seeds: list[int], operator: Operator, image_si
                 **{key: _small(batch[key], image_size) for key in CAMERA_KEYS},
                 "state": batch["observation.state"].numpy(),
                 "action": action,
+                "meant": getattr(operator, "meant", action),
                 "failure": np.array([FAILING if info["failure"] else SAFE for info in infos], np.int8),
                 "terms": np.array(terms, np.float32),
             }
@@ -68,7 +70,7 @@ class Replay:
     """Episodes of equal length in memory maps; episode i is written once, or again with the same content.
 
     Attributes:
-        arrays: name -> (n_episodes x length, ...); percepts by camera, state, action, failure, terms.
+        arrays: name -> (n_episodes x length, ...); percepts by camera, state, action, meant, failure, terms.
         percepts: camera -> the same pictures on the device of training.
         written: bool (n_episodes,).
         length: frames of an episode.
@@ -92,6 +94,7 @@ class Replay:
             **{key: ((n, 3, image_size, image_size), np.uint8) for key in CAMERA_KEYS},
             "state": ((n, len(STATE_NAMES)), np.float32),
             "action": ((n, len(ACTION_NAMES)), np.float32),
+            "meant": ((n, len(ACTION_NAMES)), np.float32),
             "failure": ((n,), np.int8),
             "terms": ((n, len(TERMS)), np.float32),
             "written": ((n_episodes,), bool),

@@ -182,8 +182,8 @@ class DreamerTraining:
         return metrics
 
     def _backpropagate(
-        self, reward: Tensor, demonstrated: Tensor, starts: Tensor, weights: Tensor, front: Tensor, wrist: Tensor,
-        *rest: Tensor,
+        self, reward: Tensor, meant: Tensor, demonstrated: Tensor, starts: Tensor, weights: Tensor, front: Tensor,
+        wrist: Tensor, *rest: Tensor,
     ) -> dict[str, Tensor]:  # fmt: skip
         """Gradients of all losses, and metrics; for `Replayed`. The arguments are those of `_batch`."""
         for optimizer in self.optimizers.values():
@@ -191,7 +191,7 @@ class DreamerTraining:
         policy, clip = self.policy, Clip(dict(zip(CAMERA_KEYS, (front, wrist))), *rest)
         loss, features, metrics = policy.model_loss(clip, reward)
         # Cloning shapes the latents, too: the few pixels that tell where to grasp weigh little in the images' error.
-        cloning_loss = policy.cloning_loss(features, clip.action, clip.valid & demonstrated[:, None])
+        cloning_loss = policy.cloning_loss(features, meant, clip.valid & demonstrated[:, None])
         features = features.detach()
         start = policy.model.world_model.latent_of(features.flatten(0, 1)[starts], clip.action.flatten(0, 1)[starts])
         actor_loss, critic_loss, imagined = policy.behavior_losses(start)
@@ -213,8 +213,9 @@ class DreamerTraining:
         """What a step learns from.
 
         Returns:
-            Rewards of a clip's windows (B, T); which rows are demonstrations, bool (B,); the frames of the flat clip
-            from which imagination starts (N,); weights of actor and cloning (2,); and what a `Clip` is made of.
+            Rewards of a clip's windows (B, T); actions meant after each frame (B, T, A), in [-1, 1]; which rows are
+            demonstrations, bool (B,); the frames of the flat clip from which imagination starts (N,); weights of actor
+            and cloning (2,); and what a `Clip` is made of.
         """
         options, policy = self.options, self.policy
         config, device = policy.config.behavior, policy.model.device
@@ -234,11 +235,13 @@ class DreamerTraining:
         ahead = first[:, None] + np.arange(reader.length)
         window = np.minimum(ahead, n_frames - 1)
         reward = config.rewards.reward(torch.from_numpy(self.replay.arrays["terms"][window]))
+        meant = torch.from_numpy(self.replay.arrays["meant"][window]).to(device)
+        meant = policy.model.normalise_action(meant).clamp(-1, 1)
         same = reader.labels.episode[window] == reader.labels.episode[first][:, None]
         valid = np.flatnonzero(same & (ahead == window))
         # At first the critic only learns what imitation is worth.
         weights = [1.0, config.cloning] if self.step >= options.pretraining else [0.0, 1.0]
-        drawn = (reward, torch.from_numpy(demonstrated), torch.from_numpy(rng.choice(valid, config.starts)))
+        drawn = (reward, meant, torch.from_numpy(demonstrated), torch.from_numpy(rng.choice(valid, config.starts)))
         percepts, *rest = (getattr(clip, field.name) for field in fields(Clip))
         return (
             *(t.to(device) for t in (*drawn, torch.tensor(weights))),

@@ -171,15 +171,6 @@ def unsteady(scene: FrankaScene, actions: Actions, rng: np.random.Generator) -> 
         yield np.clip(np.array([*(action[:3] + off), *action[3:6], gripper]), low, high)
 
 
-def jostled(scene: FrankaScene, actions: Actions, rng: np.random.Generator) -> Actions:
-    """Pushed aside now and then while the fingers are open, so that a learner sees how to come back."""
-    low, high = action_limits(scene.fps)
-    for action in actions:
-        pushed = action[6] > 0.5 and rng.random() < 0.15
-        off = rng.normal(0, 0.006, 3) if pushed else np.zeros(3)
-        yield np.clip(np.array([*(action[:3] + off), *action[3:]]), low, high)
-
-
 def clumsy(scene: bag.BagScene, speed: float, rng: np.random.Generator) -> Actions:
     """Grasp the bag somewhere, not well, and lift it."""
     segment = int(rng.choice(bag.SEGMENTS, p=HELD_ANYWHERE))
@@ -223,16 +214,34 @@ def pluck(scene: blocks.BlocksScene, slip: float, drift: float, speed: float, rn
 def fetch(scene: blocks.BlocksScene, speed: float, rng: np.random.Generator) -> Actions:
     """Pluck the green block on a straight line to the tray: the further away it stands, the flatter the pull.
 
-    Pauses of any length keep a learner from closing the fingers by the clock.
+    Try again if it is not between the fingers. The pause keeps a learner from closing the fingers by the clock.
     """
-    top = scene.block_position("green") + rng.normal(0, 0.001, 3)
-    yield from hold(PARTED, int(rng.integers(4)))
-    yield from reach(scene, np.append(top[:2], 0.27), MAX_SPEED, PARTED, scene.yaw)
-    yield from hold(PARTED, int(rng.integers(6)))
-    yield from reach(scene, np.append(top[:2], 0.20), speed, PARTED)
-    yield from hold(CLOSED, 5)
-    yield from reach(scene, TRAY, speed, CLOSED)
-    yield from hold(CLOSED, 60)
+    yield from hold(PARTED, int(rng.integers(8)))
+    slip = rng.normal(0, 0.001, 2)
+    while True:
+        yield from straddle(scene, slip, speed)
+        yield from hold(CLOSED, 5)
+        for action in reach(scene, TRAY, speed, CLOSED):
+            if not scene.truth()["held"]:
+                yield from reach(scene, scene.controller.position + up(0.04), MAX_SPEED, PARTED)
+                break
+            yield action
+        else:
+            yield from hold(CLOSED, 60)
+
+
+def straddle(scene: blocks.BlocksScene, slip: np.ndarray, speed: float) -> Actions:
+    """Put the open fingers down on either side of the green block, `slip` (2,) m off; go down only where they fit."""
+    for _ in range(10 * scene.fps):
+        place = scene.block_position("green")[:2] + slip
+        hand = scene.controller.position
+        aside, turn = np.linalg.norm(place - hand[:2]), abs(_turn_to(scene, scene.yaw))
+        fits = aside < 0.004 and turn < 0.06
+        height = 0.20 if fits else hand[2] if aside < 0.012 else 0.27
+        move = next(reach(scene, np.append(place, height), speed if fits else MAX_SPEED, PARTED, scene.yaw), None)
+        if fits and (move is None or hand[2] < 0.201):
+            return
+        yield np.array([0, 0, 0, 0, 0, 0, PARTED]) if move is None else move
 
 
 def play(scene: blocks.BlocksScene, speed: float, rng: np.random.Generator) -> Actions:
