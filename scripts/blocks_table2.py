@@ -36,6 +36,7 @@ RISKS = (0.1, 0.05)
 EPSILONS = (-0.4, 0.0, 0.2, 0.4, 0.6, 0.8)
 RISK_CURVE = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
 OUTCOMES = ("success", "violation", "incompletion")
+ENDS = ("held", "leaning")
 
 Rows = list[dict]
 """Of `run`, of one method from all starts."""
@@ -48,11 +49,12 @@ def happened(rows: Rows, outcome: str) -> np.ndarray:
 
 
 def rates(cells: list[Rows]) -> dict:
-    """Outcomes of all seeds together as {k, n, low, high}, and of each."""
+    """Outcomes of all seeds together as {k, n, low, high}, and of each; what the end of the episodes looks like."""
     share = lambda rows: {name: wilson(happened(rows, name).sum(), len(rows)) for name in OUTCOMES}  # noqa: E731
     every = [row for rows in cells for row in rows]
+    ends = {name: wilson(sum(row[name] for row in every), len(every)) for name in ENDS}
     overridden = sum(row["overridden"] for row in every) / sum(row["steps"] for row in every)
-    return {**share(every), "overridden_share": overridden, "per_seed": [share(rows) for rows in cells]}
+    return {**share(every), **ends, "overridden_share": overridden, "per_seed": [share(rows) for rows in cells]}
 
 
 def against(cells: list[Rows], bare: Rows) -> list[dict]:

@@ -8,11 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tiny
+import torch
 
 from lerobot_latentsafe.baselines.simulator import SimulatorLookahead
 from lerobot_latentsafe.envs.scenes import make_scene
+from lerobot_latentsafe.evaluation import blocks_study
 from lerobot_latentsafe.evaluation.blocks_study import lead
-from lerobot_latentsafe.teleoperators.scripted.behaviors import begin
+from lerobot_latentsafe.teleoperators.scripted.behaviors import CLOSED, begin, reach, up
 
 SCRIPT = Path(__file__).parents[1] / "scripts" / "blocks_table2.py"
 STILL = np.zeros(7)
@@ -45,6 +47,35 @@ def test_looking_ahead_leaves_no_trace(scene):
     filtered, overridden = steps(scene, 12, SimulatorLookahead(scene, horizon=3))
     assert overridden == 0
     np.testing.assert_array_equal(filtered, alone)
+
+
+class Plucking:
+    """In a policy's place, an operator who plucks the block, and puts it back if `back`."""
+
+    def __init__(self, back):
+        self.scene, self.back = blocks_study._env().scene, back
+
+    def reset(self):
+        self.actions = self.pluck()
+
+    def pluck(self):
+        for action in begin("pluck_careful", self.scene, 0.25, np.random.default_rng(0)):
+            if self.back and self.scene.block_position("green")[2] > 0.21:
+                break
+            yield action
+        yield from reach(self.scene, self.scene.controller.position - up(0.06), 0.25, CLOSED)
+        while True:
+            yield np.array([0, 0, 0, 0, 0, 0, CLOSED])
+
+    def propose(self, batch):
+        return torch.from_numpy(next(self.actions))[None]
+
+
+@pytest.mark.parametrize("back", [False, True])
+def test_success_is_that_the_block_was_picked_up_and_whether_it_still_is_stands_beside_it(back, monkeypatch):
+    monkeypatch.setattr(blocks_study, "load", lambda *names: Plucking(back))
+    row = blocks_study.run({"dreamer": "", "filter": None, "mode": "bare", "epsilon": None, "seed": 0})
+    assert row["success"] and not row["violation"] and row["held"] != back and not row["leaning"]
 
 
 def test_harmless_actions_pass(scene):

@@ -5,6 +5,7 @@ import pytest
 import tiny
 import torch
 
+from lerobot_latentsafe.commands import EvalWorldModel, PolicySource
 from lerobot_latentsafe.evaluation import world_model as questions
 from lerobot_latentsafe.evaluation.world_model import balanced_accuracy, evaluate_world_model
 
@@ -57,6 +58,11 @@ def test_what_fails_after_the_horizon_counts_as_safe(policy):
     ask = lambda steps: evaluate_world_model(policy, policy.reader, episodes(policy), n_windows=8, horizon=steps)  # noqa: E731
     soon, later = ask(1)["episodes"], ask(30)["episodes"]
     assert soon["failing"] < later["failing"] and sum(soon[k] - later[k] for k in ("failing", "safe")) == 0
+
+
+def test_a_horizon_of_no_step_is_refused_before_anything_is_loaded():
+    with pytest.raises(ValueError, match="--horizon is 0; expected at least 1 step"):
+        EvalWorldModel(PolicySource("nowhere"), horizon=0).run()
 
 
 def test_balanced_accuracy_needs_both_classes():
