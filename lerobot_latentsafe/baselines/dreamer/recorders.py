@@ -14,7 +14,7 @@ from lerobot_latentsafe.checkpoint import read_config
 from lerobot_latentsafe.datasets.collect_franka import SOURCES
 from lerobot_latentsafe.envs.franka_env import BlocksEnv
 from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, action_limits
-from lerobot_latentsafe.teleoperators.scripted.behaviors import CLOSED, Actions, begin
+from lerobot_latentsafe.teleoperators.scripted.behaviors import Actions, begin
 
 STRAYING = 2
 """In one of so many of the policy's episodes the hand is led astray."""
@@ -92,24 +92,22 @@ class _Straying:
     def __init__(self, rng: np.random.Generator, rate: float):
         self.rng, self.rate, self.left, self.move = rng, rate, 0, None
 
-    def advance(self) -> bool:
-        """Of a step: whether another move begins."""
-        begins = self.left == 0 and self.rng.random() < self.rate
-        if begins:
+    def advance(self) -> None:
+        """Go on to the next step."""
+        if self.left == 0 and self.rng.random() < self.rate:
             move = self.rng.uniform(-1, 1, 3)
             self.left = int(self.rng.integers(2, 7))
             self.move = move / np.abs(move).max() * self.rng.choice([0.5, 1.0])
         elif self.left == 0:
             self.move = None
         self.left = max(0, self.left - 1)
-        return begins
 
 
 class _Scripted:
     """An operator of `teleoperators/scripted`, whose hand does not always do what it means.
 
-    While its fingers are open it is jostled; at any time it may be led astray, and its fingers close with it in some of
-    these moves. So a learner sees how to come back. When the operator has finished it holds still.
+    While its fingers are open it is jostled; at any time it may be led astray. So a learner sees how to come back. When
+    the operator has finished it holds still.
 
     Attributes:
         meant: the action (1, 7) of this step before that.
@@ -117,17 +115,15 @@ class _Scripted:
 
     def __init__(self, operator: Actions, fps: int, rng: np.random.Generator):
         self.operator, self.rng, self.straying = operator, rng, _Straying(rng, 0.04)
-        self.limits, self.closing = action_limits(fps), False
+        self.limits = action_limits(fps)
         self.meant = np.zeros((1, len(ACTION_NAMES)), np.float32)
 
     def __call__(self, batch: dict[str, Tensor]) -> np.ndarray:
         meant = next(self.operator, np.append(np.zeros(6), self.meant[0, 6]))
         self.meant, done = meant[None].astype(np.float32), meant.copy()
-        if self.straying.advance():
-            self.closing = self.rng.random() < 0.4
+        self.straying.advance()
         if self.straying.move is not None:
             done[:3] = self.straying.move * self.limits[1][:3]
-            done[6] = CLOSED if self.closing else done[6]
         elif meant[6] > 0.5 and self.rng.random() < 0.15:
             done[:3] += self.rng.normal(0, 0.006, 3)
             done[5] += self.rng.normal(0, 0.05)

@@ -220,7 +220,7 @@ def fetch(scene: blocks.BlocksScene, speed: float, rng: np.random.Generator) -> 
     slip = rng.normal(0, 0.001, 2)
     while True:
         yield from straddle(scene, slip, speed)
-        yield from hold(CLOSED, 5)
+        yield from hold(CLOSED, 6)
         for action in reach(scene, TRAY, speed, CLOSED):
             if not scene.truth()["held"]:
                 yield from reach(scene, scene.controller.position + up(0.04), MAX_SPEED, PARTED)
@@ -236,10 +236,10 @@ def straddle(scene: blocks.BlocksScene, slip: np.ndarray, speed: float) -> Actio
         place = scene.block_position("green")[:2] + slip
         hand = scene.controller.position
         aside, turn = np.linalg.norm(place - hand[:2]), abs(_turn_to(scene, scene.yaw))
-        fits = aside < 0.004 and turn < 0.06
+        fits = aside < (0.004 if hand[2] > 0.22 else 0.008) and turn < 0.06
         height = 0.20 if fits else hand[2] if aside < 0.012 else 0.27
         move = next(reach(scene, np.append(place, height), speed if fits else MAX_SPEED, PARTED, scene.yaw), None)
-        if fits and (move is None or hand[2] < 0.201):
+        if fits and (move is None or hand[2] < 0.205):
             return
         yield np.array([0, 0, 0, 0, 0, 0, PARTED]) if move is None else move
 
