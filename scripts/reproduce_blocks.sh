@@ -12,7 +12,7 @@ mkdir -p "$OUT"
 
 training= critic= table="--output_dir=results/blocks"
 if [ "$quick" ]; then
-  training="--demonstrations=40 --pretraining=300 --steps=600 --collect_every=100 --batch_size=12 --save_every=200"
+  training="--demonstrations=40 --pretraining=300 --steps=600 --n_envs=8 --batch_size=12 --save_every=200"
   critic="--steps=600"
   table="--output_dir=$OUT/results --n=12 --n_curve=4"
 fi
