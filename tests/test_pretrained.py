@@ -16,8 +16,8 @@ def size_of(name):
 
 
 def test_names_that_users_rely_on_are_committed():
-    bag = {"bag", "bag_diffusion_weak", "bag_diffusion_strong"}
-    assert {"dubins", "dubins_diffusion_reckless", *bag} <= set(committed_names())
+    bag, blocks = {"bag", "bag_diffusion_weak", "bag_diffusion_strong"}, {"blocks", "blocks_dreamer"}
+    assert {"dubins", "dubins_diffusion_reckless", *bag, *blocks} <= set(committed_names())
 
 
 def test_every_committed_checkpoint_loads():
@@ -33,11 +33,11 @@ def test_every_committed_checkpoint_loads():
 
 
 def test_weights_are_small():
-    assert 0 < size_of("dubins") <= 5e6 and 0 < size_of("bag") <= 5e6
+    assert all(0 < size_of(name) <= 5e6 for name in ("dubins", "bag", "blocks"))
     assert sum(size_of(name) for name in committed_names()) <= 20e6
 
 
-@pytest.mark.parametrize("name", ["dubins", "bag"])
+@pytest.mark.parametrize("name", ["dubins", "bag", "blocks"])
 def test_filter_stores_no_path_of_the_machine_it_was_trained_on(name):
     config = LatentSafePolicy.from_pretrained(name).config
     assert config.frame_cache is None and config.base_policy_path is None
@@ -80,3 +80,14 @@ def test_filter_keeps_the_candies_in_the_bag_that_an_operator_pulls_up_by_its_cl
             operator = begin("closed_end", scene, None, np.random.default_rng([0, seed]))
             lost[name] += drive(scene, actor, operator)["lost"]
     assert lost["bare"] >= scene.n_candies and lost["shielded"] <= lost["bare"] / 4
+
+
+def test_task_policy_of_the_blocks_topples_less_under_the_filter_whose_world_model_it_shares():
+    from lerobot_latentsafe.evaluation.blocks_study import run, world_model_of
+
+    assert world_model_of("blocks_dreamer") == "blocks"
+    toppled = {}
+    for mode, name in (("bare", None), ("filter", "blocks")):
+        job = {"dreamer": "blocks_dreamer", "filter": name, "mode": mode, "epsilon": 0.4}
+        toppled[mode] = sum(run({**job, "seed": seed})["violation"] for seed in range(300_000, 300_012))
+    assert toppled["bare"] >= 3 and toppled["filter"] <= toppled["bare"] / 2
