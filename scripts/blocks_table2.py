@@ -81,7 +81,7 @@ def main() -> None:
     parser.add_argument("--filters", nargs="+", required=True, help="latent safety filters, one a seed")
     parser.add_argument("--risks", nargs="+", required=True, help="filters with a risk critic, one a seed")
     parser.add_argument("--n", type=int, default=200, help="starts")
-    parser.add_argument("--n_curve", type=int, default=100, help="starts of each point of the curve, first seeds only")
+    parser.add_argument("--n_curve", type=int, default=100, help="starts of each point of the curves, each seed")
     parser.add_argument("--workers", type=int, default=1, help="processes")
     parser.add_argument("--cells", type=Path, default=Path("outputs/blocks/cells.jsonl"))
     parser.add_argument("--output_dir", type=Path, default=Path("results/blocks"))
@@ -102,8 +102,8 @@ def main() -> None:
         **{(f"sqrl_{r:g}", path): table("filter", path, -r) for r in RISKS for path in risks},
         "lookahead": table("lookahead"),
         "watched": table("monitor", filters[0], EPSILON),
-        **{("epsilon", e): curve("filter", filters[0], e) for e in EPSILONS},
-        **{("risk", r): curve("filter", risks[0], -r) for r in RISK_CURVE},
+        **{("epsilon", e, path): curve("filter", path, e) for e in EPSILONS for path in filters},
+        **{("risk", r, path): curve("filter", path, -r) for r in RISK_CURVE for path in risks},
         "no filter": curve("bare"),
     }
     rows = iter(
@@ -116,10 +116,10 @@ def main() -> None:
         seeds = [ran[cell] for cell in cells if cell == name or cell[0] == name]
         methods[name] = {**rates(seeds), "mcnemar_against_dreamer": against(seeds, bare)}
     curves = {
-        title: [{"threshold": x, **rates([ran[kind, x]])} for x in thresholds]
-        for title, kind, thresholds in (
-            ("latent safety filter (epsilon)", "epsilon", EPSILONS),
-            ("SQRL (risk)", "risk", RISK_CURVE),
+        title: [{"threshold": x, **rates([ran[kind, x, path] for path in paths])} for x in thresholds]
+        for title, kind, thresholds, paths in (
+            ("latent safety filter (epsilon)", "epsilon", EPSILONS, filters),
+            ("SQRL (risk)", "risk", RISK_CURVE, risks),
         )
     }
     no_filter = rates([ran["no filter"]])

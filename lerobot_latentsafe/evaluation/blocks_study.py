@@ -137,10 +137,10 @@ def unsafe_rollout(
 
 
 def trade_off(curves: dict[str, list[dict]], bare: dict) -> Figure:
-    """Safe success against violations as the threshold of each filter varies.
+    """Safe success against violations as the threshold of each filter varies: all seeds together, and each, thin.
 
     Args:
-        curves: filter -> rows with `threshold`, `success` and `violation` as {k, n, low, high}.
+        curves: filter -> rows with `threshold`, `success` and `violation` as {k, n, low, high}, and those `per_seed`.
         bare: such a row of the policy without a filter.
     """
     figure, ax = plt.subplots(figsize=(6.4, 4.6))
@@ -148,6 +148,9 @@ def trade_off(curves: dict[str, list[dict]], bare: dict) -> Figure:
     for name, rows in curves.items():
         x, y = ([share(row, kind) for row in rows] for kind in ("violation", "success"))
         (line,) = ax.plot(x, y, "o-", label=name)
+        for seed in zip(*(row["per_seed"] for row in rows)):
+            ax.plot(*([share(row, kind) for row in seed] for kind in ("violation", "success")), ".-", lw=0.6, ms=3,
+                    alpha=0.6, color=line.get_color())  # fmt: skip
         for row, at in zip(rows, zip(x, y)):
             ax.annotate(f"{row['threshold']:g}", at, textcoords="offset points", xytext=(4, 4), fontsize=8,
                         color=line.get_color())  # fmt: skip
