@@ -81,7 +81,7 @@ def main() -> None:
     parser.add_argument("--filters", nargs="+", required=True, help="latent safety filters, one a seed")
     parser.add_argument("--risks", nargs="+", required=True, help="filters with a risk critic, one a seed")
     parser.add_argument("--n", type=int, default=200, help="starts")
-    parser.add_argument("--n_curve", type=int, default=100, help="starts of each point of the curves, each seed")
+    parser.add_argument("--n_curve", type=int, default=50, help="starts of each point of the curves, each seed")
     parser.add_argument("--workers", type=int, default=1, help="processes")
     parser.add_argument("--cells", type=Path, default=Path("outputs/blocks/cells.jsonl"))
     parser.add_argument("--output_dir", type=Path, default=Path("results/blocks"))

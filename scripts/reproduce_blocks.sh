@@ -10,14 +10,14 @@ BIN=.venv/bin
 export HF_HUB_OFFLINE=1 OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
 mkdir -p "$OUT"
 
-training= critic= table="--output_dir=results/blocks"
+training= critic= results=results/blocks n=
 if [ "$quick" ]; then
   training="--demonstrations=40 --pretraining=300 --steps=600 --n_envs=8 --batch_size=12 --save_every=200"
   critic="--steps=600"
-  table="--output_dir=$OUT/results --n=12 --n_curve=4"
+  results="$OUT/results" n="--n=12 --n_curve=4"
 fi
 
-# $training, $critic and $table are lists of options.
+# $training, $critic and $n are lists of options.
 # shellcheck disable=SC2086
 {
   [ -e "$OUT/dreamer/episodes" ] ||
@@ -35,5 +35,6 @@ fi
   done
 
   $BIN/python scripts/blocks_table2.py --dreamer "$OUT/dreamer/policy" --filters "$OUT"/reachability/final_{0,1,2} \
-    --risks "$OUT"/risk/final_{0,1,2} --cells "$OUT/cells.jsonl" --workers="${WORKERS:-1}" $table
+    --risks "$OUT"/risk/final_{0,1,2} --cells "$OUT/cells.jsonl" --output_dir="$results" --workers="${WORKERS:-1}" $n
+  cp "$OUT/dreamer/log.jsonl" "$results/train_dreamer.jsonl"
 }

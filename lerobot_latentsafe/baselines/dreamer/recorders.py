@@ -124,7 +124,7 @@ class _Scripted:
         self.straying.advance()
         if self.straying.move is not None:
             done[:3] = self.straying.move * self.limits[1][:3]
-        elif meant[6] > 0.5 and self.rng.random() < 0.15:
+        elif meant[6] > 0.5 and self.rng.random() < 0.3:
             done[:3] += self.rng.normal(0, 0.006, 3)
             done[5] += self.rng.normal(0, 0.05)
         return np.clip(done, *self.limits)[None]

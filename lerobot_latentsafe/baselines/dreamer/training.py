@@ -200,11 +200,12 @@ class DreamerTraining:
         return {name: value.detach() for name, value in metrics.items()}
 
     def _descend(self, name: str) -> None:
-        """A gradient step; step sizes rise over 100 steps and stay, so that a run begins like any longer one."""
-        optimizer, rise = self.optimizers[name], min(1.0, (self.step + 1) / 100)
+        """A gradient step; step sizes rise over the first 100 steps, and fall to nothing over the last fifth."""
+        optimizer, steps = self.optimizers[name], self.options.steps
+        scale = min(1.0, (self.step + 1) / 100, 5 * (steps - self.step) / steps)
         parameters = []
         for group, lr in zip(optimizer.param_groups, self.step_sizes[name]):
-            group["lr"] = lr * rise
+            group["lr"] = lr * scale
             parameters += group["params"]
         torch.nn.utils.clip_grad_norm_(parameters, self.policy.model.config.grad_clip_norm)
         optimizer.step()
