@@ -1,13 +1,13 @@
 #!/usr/bin/env bash
 # Everything of results/blocks from nothing, resumable: what is finished is skipped, what was killed goes on.
-#   scripts/reproduce_blocks.sh [--quick] [OUT]     OUT defaults to outputs/blocks
+#   scripts/reproduce_blocks.sh [--quick] [OUT]     OUT defaults to outputs/blocks; CORES to 2
 # --quick runs the whole table small, into OUT/results: its numbers mean nothing.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 quick=; [ "${1:-}" = --quick ] && { quick=1; shift; }
 OUT=${1:-outputs/blocks${quick:+_quick}}
-BIN=.venv/bin
-export HF_HUB_OFFLINE=1 OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
+BIN=.venv/bin CORES=${CORES:-2}
+export HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1
 mkdir -p "$OUT"
 
 training= critic= results=results/blocks n=
@@ -20,7 +20,7 @@ fi
 # $training, $critic and $n are lists of options.
 # shellcheck disable=SC2086
 {
-  [ -e "$OUT/dreamer/episodes" ] ||
+  [ -e "$OUT/dreamer/episodes" ] || OMP_NUM_THREADS=$CORES \
     $BIN/latentsafe train-dreamer --config_path=configs/blocks_dreamer.yaml --output_dir="$OUT/dreamer" $training
 
   for target in reachability risk; do
@@ -35,6 +35,6 @@ fi
   done
 
   $BIN/python scripts/blocks_table2.py --dreamer "$OUT/dreamer/policy" --filters "$OUT"/reachability/final_{0,1,2} \
-    --risks "$OUT"/risk/final_{0,1,2} --cells "$OUT/cells.jsonl" --output_dir="$results" --workers="${WORKERS:-1}" $n
+    --risks "$OUT"/risk/final_{0,1,2} --cells "$OUT/cells.jsonl" --output_dir="$results" --workers="$CORES" $n
   cp "$OUT/dreamer/log.jsonl" "$results/train_dreamer.jsonl"
 }
