@@ -201,7 +201,7 @@ def test_demonstrations_show_what_the_operator_meant_beside_what_a_jostled_hand_
     meant, done = replay.arrays["meant"][:n], replay.arrays["action"][:n]
     speed = 20 * np.linalg.norm(meant[:, :3], axis=1)
     assert speed.max() == pytest.approx(0.3, abs=1e-3)  # on the way to the blocks
-    assert 0 < (meant != done).any(1).mean() < 0.5 and replay.written.all()
+    assert 0.1 < (meant != done).any(1).mean() < 0.8 and replay.written.all()
 
 
 def test_a_hand_is_led_astray_at_up_to_full_speed_and_jostled_only_while_its_fingers_are_open():
