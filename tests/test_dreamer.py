@@ -143,6 +143,15 @@ def test_other_workers_record_the_same_episodes(monkeypatch):
             np.testing.assert_array_equal(here[name], there[name])
 
 
+def test_step_sizes_rise_at_first_and_fall_to_nothing_over_the_last_fifth(trained):
+    run = DreamerTraining(tiny.dreamer_options(trained))
+    run.options.steps = 1000
+    for run.step, share in ((0, 0.01), (99, 1), (800, 1), (900, 0.5), (999, 0.005)):
+        run._descend("behavior")
+        found = [group["lr"] for group in run.optimizers["behavior"].param_groups]
+        assert found == pytest.approx([lr * share for lr in run.step_sizes["behavior"]])
+
+
 def test_resuming_with_other_options_is_refused(trained):
     with pytest.raises(ValueError, match="run with other options \\(batch_size\\)"):
         DreamerTraining(tiny.dreamer_options(trained, batch_size=5))
@@ -201,7 +210,7 @@ def test_demonstrations_show_what_the_operator_meant_beside_what_a_jostled_hand_
     meant, done = replay.arrays["meant"][:n], replay.arrays["action"][:n]
     speed = 20 * np.linalg.norm(meant[:, :3], axis=1)
     assert speed.max() == pytest.approx(0.3, abs=1e-3)  # on the way to the blocks
-    assert 0.1 < (meant != done).any(1).mean() < 0.8 and replay.written.all()
+    assert 0.1 < (meant != done).any(1).mean() < 0.6 and replay.written.all()
 
 
 def test_a_hand_is_led_astray_at_up_to_full_speed_and_jostled_only_while_its_fingers_are_open():

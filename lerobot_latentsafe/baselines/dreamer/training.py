@@ -54,7 +54,7 @@ class TrainDreamer:
     pretraining: int = 2000
     """Steps on demonstrations alone: world model, margin and cloning."""
     steps: int = 10_000
-    """All steps."""
+    """All steps; over the last fifth step sizes fall, so a longer run is another one."""
     collect_every: int = 100
     """Steps between rounds of episodes."""
     n_envs: int = 8
