@@ -68,8 +68,9 @@ class Collect:
     bag_climbs (up in steps and pauses, as under a filter), bag_lifts (one and the same lift by either end),
     bag_between (branches and climbs, grasped between ends and middle), bag_dither and bag_clumsy (grasped badly and
     lifted by unsteady fingers, as by a policy that errs), bag_policies (the committed diffusion policies act and
-    are overridden now and then), bag_shielded (the committed filter overrides them), bag_pulls (whole lifts by
-    either end and the middle), bag_middle, bag_strong and bag_weak (demonstrations whose hand is pushed aside while
+    are interrupted now and then), bag_shielded (they are, by a slow way down, where the committed filter would override
+    them), bag_retreats (whole lifts by either end and the middle, lowered slowly or stopped now and then), bag_pulls
+    (the same undisturbed), bag_middle, bag_strong and bag_weak (demonstrations whose hand is pushed aside while
     the operator is recorded), blocks_demos, blocks_random.
     A killed recording of the Franka goes on if started again.
     """

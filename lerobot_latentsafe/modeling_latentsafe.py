@@ -93,7 +93,7 @@ class LatentSafePolicy(PreTrainedPolicy):
         for sign, bound in (("-", self.config.fallback_low), ("+", self.config.fallback_high)):
             allowed = [chosen is None or name in chosen or sign + name in chosen for name in names]
             bound = torch.tensor(bound) if bound else float(sign + "1") * torch.ones(len(names))
-            bounds.append((bound * torch.tensor(allowed)).to(moves.device) * moves)
+            bounds.append(self.config.fallback_pace * (bound * torch.tensor(allowed)).to(moves.device) * moves)
         sizes = self.world_model.feature_dim, len(moves), candidates, self.config.reachability
         return SafetyCritic(*sizes, *bounds, self.config.target).to(moves.device)
 
@@ -199,7 +199,8 @@ class LatentSafePolicy(PreTrainedPolicy):
             margin = self.imagination.margin(latent)
             return margin, self.imagination.complete(latent, still.expand(len(margin), -1))
         critic = self.critic if self.config.law in BACKUPS else None
-        return look_ahead(self.imagination, latent, self.critic.held_actions(still), self.config.lookahead, critic)
+        held, config = self.critic.held_actions(still), self.config
+        return look_ahead(self.imagination, latent, held, config.lookahead, critic, config.tie)
 
     @property
     def needed_stage(self) -> str:

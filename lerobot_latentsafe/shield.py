@@ -52,6 +52,7 @@ class Shield:
         self.executed: Tensor | None = None
         self.decision: FilterDecision | None = None
         self.decided_at: float | None = None
+        self.acted: Tensor | None = None
         self._told = False
 
     @torch.no_grad()
@@ -96,22 +97,24 @@ class Shield:
         decision = least_restrictive(
             proposed, fallback, value, margin, self._threshold(), fault, monitor=config.mode == "monitor"
         )
+        acted = 0 if self.acted is None else self.acted
+        self.acted = (acted + 1) * decision.intervened
         self.latent, self.decision, self.decided_at = latent, decision, finished
-        self.executed = model.normalise_action(decision.action).nan_to_num(0.0).clamp(-1, 1)
+        self.was_executed(decision.action)
         self._tell(decision)
         return decision
 
-    @property
-    def acting(self) -> Tensor | None:
-        """Whether the filter acted at the last tick: bool (B,); None before the first."""
-        return None if self.decision is None else self.decision.intervened
+    def was_executed(self, action: Tensor) -> None:
+        """Remember (B, A) in robot units as what was done; call it where something else was than was decided."""
+        self.executed = self.filter.normalise_action(action).nan_to_num(0.0).clamp(-1, 1)
 
     def _threshold(self) -> float | Tensor:
-        """What V must exceed: epsilon, or `release` where the filter is acting."""
+        """What V must exceed: epsilon; where the filter acts `release`, and before `dwell` steps nothing will do."""
         config = self.filter.config
-        if self.acting is None:
+        if self.acted is None:
             return config.epsilon
-        return torch.where(self.acting, max(config.epsilon, config.release), config.epsilon)
+        acting = torch.where(self.acted < config.dwell, torch.inf, max(config.epsilon, config.release))
+        return torch.where(self.acted > 0, acting, config.epsilon)
 
     def _tell(self, decision: FilterDecision) -> None:
         """Log the first override of an episode."""
@@ -136,17 +139,17 @@ class Shield:
             fresh = other.decided_at is not None and 0 <= self.clock() - other.decided_at <= within_s
             if fresh and torch.equal(other.decision.action.cpu(), action) and self._no_stricter_than(other):
                 self.latent, self.executed = other.latent, other.executed
-                self.decision, self.decided_at = other.decision, other.decided_at
+                self.decision, self.decided_at, self.acted = other.decision, other.decided_at, other.acted
                 return True
         return False
 
     def _no_stricter_than(self, other: "Shield") -> bool:
         """Whether the other has our weights, acts, and passes nothing that we would not."""
         own, theirs = self.filter.config, other.filter.config
-        same = all(
-            getattr(own, name) == getattr(theirs, name) for name in (*TRAINED, "law", "lookahead", "guard", "samples")
-        )
-        if not same or theirs.mode == "monitor" or theirs.epsilon < own.epsilon or theirs.release < own.release:
+        alike = (*TRAINED, "law", "lookahead", "tie", "guard", "samples")
+        same = all(getattr(own, name) == getattr(theirs, name) for name in alike)
+        laxer = any(getattr(theirs, name) < getattr(own, name) for name in ("epsilon", "release", "dwell"))
+        if not same or theirs.mode == "monitor" or laxer:
             return False
         if other not in self._twins:  # weights are compared once
             ours, its = self.filter.state_dict(), other.filter.state_dict()

@@ -14,6 +14,8 @@ done
   --root="$OUT/bag_policies" --seed=23 --n_episodes=175
 [ -e "$OUT/bag_pulls" ] || .venv/bin/latentsafe collect --source=bag_pulls --repo_id=latentsafe/bag_pulls \
   --root="$OUT/bag_pulls" --seed=25
-# As the committed filter shields them.
+[ -e "$OUT/bag_retreats" ] || .venv/bin/latentsafe collect --source=bag_retreats --repo_id=latentsafe/bag_retreats \
+  --root="$OUT/bag_retreats" --seed=31
+# Interrupted where the committed filter would act.
 [ -e "$OUT/bag_shielded" ] || .venv/bin/latentsafe collect --source=bag_shielded --repo_id=latentsafe/bag_shielded \
   --root="$OUT/bag_shielded" --seed=29 --n_episodes=100

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +9,9 @@ from tiny import save_franka_filter
 from lerobot_latentsafe.datasets import collect_franka
 from lerobot_latentsafe.datasets.collect_franka import SOURCES, Source
 from lerobot_latentsafe.datasets.collect_franka import collect_franka as collect
+from lerobot_latentsafe.datasets.interruptions import BRIEF, RETREATING, Interruptions
 from lerobot_latentsafe.datasets.labels import FailureLabels
+from lerobot_latentsafe.robots.franka_interface import action_limits
 
 COLUMNS = ("observation.state", "action", "failure", "next.reward", "episode_index")
 
@@ -15,8 +19,6 @@ COLUMNS = ("observation.state", "action", "failure", "next.reward", "episode_ind
 @pytest.fixture
 def tiny(monkeypatch):
     """Blocks at 32 pixels, an episode a part."""
-    from dataclasses import replace
-
     scene = replace(collect_franka.SCENES["blocks"], image_size=32)
     monkeypatch.setitem(collect_franka.SCENES, "blocks", scene)
     monkeypatch.setattr(collect_franka, "EPISODES_A_PART", 1)
@@ -139,10 +141,10 @@ def test_a_policy_is_recorded_as_it_acts_and_is_overridden(tiny, monkeypatch):
 
     monkeypatch.setattr(policy_operator, "BasePolicy", Closes)
     collect_franka._policy_operator.cache_clear()
-    source = Source("blocks", {"closes": 2}, policies=True, seconds=3.0)
+    source = Source("blocks", {"closes": 2}, policies=True, hand=BRIEF, seconds=3.0)
     with LatentSafeFrankaMujoco(LatentSafeFrankaMujocoConfig(scene="blocks", image_size=32)) as robot:
         runs = [list(collect_franka.episode_frames(robot, source, episode, 0)) for episode in (0, 0, 1)]
-    operator = collect_franka._policy_operator("closes", 20, None)
+    operator = collect_franka._policy_operator("closes", 20, BRIEF, None)
     collect_franka._policy_operator.cache_clear()
     actions = np.stack([[frame["action"] for frame in frames] for frames in runs])
     assert actions.shape == (3, 60, 7)
@@ -156,24 +158,63 @@ def test_a_policy_is_recorded_as_it_acts_and_is_overridden(tiny, monkeypatch):
     np.testing.assert_array_equal(np.stack(operator.policy.executed), actions[overridden])
 
 
-def test_a_filter_may_override_instead(tiny, tmp_path, monkeypatch):
+def test_a_filter_may_say_when(tiny, tmp_path, monkeypatch):
     from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
     from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
     from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
 
     monkeypatch.setattr(Closes, "up", 0.01)
     monkeypatch.setattr(LatentSafePolicy, "attach", lambda self, path: setattr(self, "_base", [Closes(path, "cpu")]))
+    hand = replace(RETREATING, steps=(2, 4), down=1.0)
     for epsilon, passes in ((2.0, False), (-2.0, True)):
         path = str(save_franka_filter(tmp_path / str(epsilon), epsilon=epsilon))
-        source = Source("blocks", {"closes": 1}, policies=True, shield=path, seconds=0.5)
+        source = Source("blocks", {"closes": 1}, policies=True, hand=hand, shield=path, seconds=1.0)
         with LatentSafeFrankaMujoco(LatentSafeFrankaMujocoConfig(scene="blocks", image_size=32)) as robot:
             frames = list(collect_franka.episode_frames(robot, source, 0, 0))
         actions = np.stack([frame["action"] for frame in frames])
-        assert ((actions[:, 0] == np.float32(0.001)) == passes).all()
-        # What was done instead is told to the policy, step by step.
-        told = collect_franka._policy_operator("closes", 20, path).policy.base.executed
-        np.testing.assert_allclose(np.reshape(told, (-1, 7)), actions[:0] if passes else actions, atol=1e-6)
+        lowered = actions[:, 0] == 0
+        assert lowered[0] != passes and not (passes and lowered.any())
+        assert (actions[lowered, 2] < 0).all() and (actions[~lowered, 2] == np.float32(0.01)).all()
+        # What was done instead is told to the policy, and to the filter, which remembers it.
+        operator = collect_franka._policy_operator("closes", 20, hand, path)
+        np.testing.assert_allclose(np.reshape(operator.policy.executed, (-1, 7)), actions[lowered], atol=1e-6)
+        executed = operator.filter.denormalise_action(operator.filter.shield.executed)[0]
+        np.testing.assert_allclose(executed.numpy(), actions[-1], atol=1e-5)
     collect_franka._policy_operator.cache_clear()
+
+
+def test_an_operator_is_interrupted_while_the_fingers_close_and_goes_on(tiny):
+    from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
+    from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
+
+    actions = {}
+    for hand in (None, RETREATING):
+        source = Source("bag", {"open_end": 1}, hand=hand, seconds=8.0)
+        with LatentSafeFrankaMujoco(LatentSafeFrankaMujocoConfig(scene="bag", image_size=32)) as robot:
+            frames = list(collect_franka.episode_frames(robot, source, 3, 0))
+        actions[hand] = np.stack([frame["action"] for frame in frames])
+    alone, interrupted = actions.values()
+    differs = np.abs(alone - interrupted).max(1) > 0
+    assert differs.any() and not differs[: np.argmax(alone[:, 6] < 0.5) + 1].any()
+    first = interrupted[np.argmax(differs)]
+    limits = action_limits(15)
+    assert (first[[0, 1, 3, 4, 5]] == 0).all() and 0.5 * limits[0][2] - 1e-6 <= first[2] <= 0 and first[6] < 0.5
+
+
+def test_interruptions_last_as_long_and_go_as_fast_as_they_are_asked_to():
+    limits, action = action_limits(15), np.array([0.001, 0, 0.01, 0, 0, 0, 0.0])
+    interruptions = Interruptions(RETREATING, limits, np.random.default_rng(0))
+    assert not interruptions(action)[1]  # fingers that were open
+    taken = [interruptions(action) for _ in range(20_000)]
+    speeds = np.array([executed[2] / limits[0][2] for executed, interrupted in taken if interrupted])
+    held = speeds == 0
+    assert 0.2 < held.mean() < 0.4
+    assert speeds[~held].min() >= 0.15 and speeds.max() <= 0.5
+    flags = "".join(str(int(interrupted)) for _, interrupted in taken)
+    lengths = [len(run) for run in flags.split("0") if run]
+    assert min(lengths) == 3 and max(lengths) == 39
+    passed = [executed for executed, interrupted in taken if not interrupted]
+    assert all((executed == action).all() for executed in passed)
 
 
 def test_mixes_keep_their_proportions():

@@ -288,17 +288,49 @@ def test_once_the_filter_acts_the_policy_is_released_above_another_value(permiss
     value = first.value
     for acting, release in ((False, 1.0), (True, value.min().item() - 1e-3), (True, value.max().item() + 1e-3)):
         shield.reset()
-        config.release, shield.decision = release, replace(first, intervened=torch.full((3,), acting))
-        assert (shield(along(1)[0], actions(LEFT)).intervened == (release > value) & acting).all()
-        assert torch.equal(shield.acting, shield.decision.intervened)
+        config.release, shield.acted = release, torch.full((3,), int(acting))
+        acts = shield(along(1)[0], actions(LEFT)).intervened
+        assert (acts == (release > value) & acting).all()
+        assert torch.equal(shield.acted, (1 + acting) * acts)
+
+
+def test_once_the_filter_acts_it_acts_for_some_steps(permissive):
+    shield = permissive.shield
+    permissive.config.dwell = 3
+    assert not shield(along(1)[0], actions(LEFT)).intervened.any()
+    assert shield(along(1)[0], actions([9.0, 1.0], LEFT, LEFT)).intervened.tolist() == [True, False, False]
+    acts = [shield(along(1)[0], actions(LEFT)).intervened.tolist() for _ in range(4)]
+    assert acts == [[True, False, False]] * 2 + [[False] * 3] * 2
+    shield(along(1)[0], actions([9.0, 1.0]))
     shield.reset()
-    assert shield.acting is None
+    assert not shield(along(1)[0], actions(LEFT)).intervened.any()
 
 
-@pytest.mark.parametrize("release", [1.0, math.nan])
-def test_a_release_that_is_never_reached_is_refused(policy, release):
-    with pytest.raises(ValueError, match=rf"--policy.release is {release}; expected less than 1"):
-        replace(policy.config, release=release)
+def test_what_was_executed_instead_is_remembered(policy):
+    for told in (actions(LEFT), actions(STRAIGHT)):
+        policy.shield.reset()
+        policy.shield(along(1)[0], actions(LEFT))
+        policy.shield.was_executed(told)
+        predicted = policy.world_model.step(policy.shield.latent, policy.normalise_action(told))
+        policy.shield(along(1)[0], actions(LEFT))
+        torch.testing.assert_close(policy.shield.latent["h"], predicted["h"])
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong", "expected"),
+    [
+        ("release", 1.0, "less than 1"),
+        ("release", math.nan, "less than 1"),
+        ("dwell", 0, "at least 1 step"),
+        ("tie", -0.1, "expected 0"),
+        ("tie", math.nan, "expected 0"),
+        ("fallback_pace", 0.0, "more than 0"),
+        ("fallback_pace", math.nan, "more than 0"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(policy, name, wrong, expected):
+    with pytest.raises(ValueError, match=rf"--policy.{name} is {wrong}; .*{expected}"):
+        replace(policy.config, **{name: wrong})
 
 
 def test_continuous_fallback_stays_in_range(tiny_continuous_filter):

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lerobot_latentsafe.datasets.interruptions import BRIEF, RETREATING, Hand, Interruptions
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE
 from lerobot_latentsafe.envs.scenes import CLUMSINESS, HELD_ANYWHERE, SCENES
 from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, STATE_NAMES, action_limits, read_action
@@ -29,8 +30,6 @@ if TYPE_CHECKING:
 EPISODES_A_PART = 50
 HIGH = 0.10
 """Height of the hand below which the fingers may hold something, m."""
-OVERRIDDEN = 0.06
-"""Chance that a policy whose fingers are closed is overridden from a step on."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +47,9 @@ class Source:
         pushed: standard deviation of the speed in m/s at which the hand is pushed now and then, and high up its fingers
             are closed, while the operator keeps them open. Recorded is what the operator commands, so that a policy
             learns to correct and not to stray (DART, Laskey et al. 2017).
-        policies: the behaviours are names of policies, which are overridden now and then; see `policy_operator.py`.
-        shield: name of the filter that overrides them instead.
+        policies: the behaviours are names of policies, see `policy_operator.py`.
+        hand: how policies and operators are interrupted, if at all.
+        shield: name of the filter that says when, instead of chance.
         seconds: how long an episode lasts; None: as long as the scene's.
     """
 
@@ -62,6 +62,7 @@ class Source:
     astray: float = 0.0
     pushed: float = 0.0
     policies: bool = False
+    hand: Hand | None = None
     shield: str | None = None
     seconds: float | None = None
 
@@ -75,6 +76,8 @@ class Source:
         return str(np.random.default_rng(0).permutation(names)[episode % len(names)])
 
 
+POLICIES = {"bag_diffusion_weak": 150, "bag_diffusion_strong": 50}
+
 SOURCES: dict[str, Source] = {
     "bag_mix": Source("bag", {"random": 1000, "open_end": 75, "middle": 75, "closed_end": 100, "side_to_side": 50}),
     "bag_branches": Source("bag", {"branch": 500}, branches=5),
@@ -85,9 +88,10 @@ SOURCES: dict[str, Source] = {
         "bag", {"dither": 200, "branch": 100, "rise": 100}, branches=1, grasps=HELD_ANYWHERE, clumsiness=CLUMSINESS
     ),
     "bag_clumsy": Source("bag", {"clumsy": 120}),
-    "bag_policies": Source("bag", {"bag_diffusion_weak": 150, "bag_diffusion_strong": 50}, policies=True, seconds=10.0),
-    "bag_shielded": Source(
-        "bag", {"bag_diffusion_weak": 150, "bag_diffusion_strong": 50}, policies=True, shield="bag", seconds=10.0
+    "bag_policies": Source("bag", POLICIES, policies=True, hand=BRIEF, seconds=10.0),
+    "bag_shielded": Source("bag", POLICIES, policies=True, hand=RETREATING, shield="bag", seconds=10.0),
+    "bag_retreats": Source(
+        "bag", {"open_end": 80, "middle": 30, "closed_end": 90}, astray=0.3, hand=RETREATING, seconds=8.0
     ),
     "bag_pulls": Source("bag", {"open_end": 80, "middle": 30, "closed_end": 50, "side_to_side": 40}, astray=0.3),
     "bag_middle": Source("bag", {"middle": 100}, astray=0.8),
@@ -239,19 +243,29 @@ def _operator(
 
     behavior = source.behavior(episode)
     if source.policies:
-        operator = _policy_operator(behavior, robot.scene.fps, source.shield)
+        operator = _policy_operator(behavior, robot.scene.fps, source.hand, source.shield)
         operator.begin(robot.scene.seed)
         yield operator.act
         return
     with LatentSafeScripted(LatentSafeScriptedConfig(behavior=behavior, seed=episode)) as scripted:
-        yield lambda seen: scripted.get_action()
+        if source.hand is None:
+            yield lambda seen: scripted.get_action()
+            return
+        rng = np.random.default_rng([9, robot.scene.seed])
+        interruptions = Interruptions(source.hand, action_limits(robot.scene.fps), rng)
+        yield lambda seen: _interrupted(scripted.get_action(), interruptions)
+
+
+def _interrupted(action: dict[str, float], interruptions: Interruptions) -> dict[str, float]:
+    executed, _ = interruptions(np.array([action[name] for name in ACTION_NAMES]))
+    return dict(zip(ACTION_NAMES, executed.tolist()))
 
 
 @cache
-def _policy_operator(path: str, fps: int, shield: str | None) -> "PolicyOperator":
+def _policy_operator(path: str, fps: int, hand: Hand, shield: str | None) -> "PolicyOperator":
     from lerobot_latentsafe.datasets.policy_operator import PolicyOperator
 
-    return PolicyOperator(path, fps, OVERRIDDEN, shield)
+    return PolicyOperator(path, fps, hand, shield)
 
 
 def _pushes(sd: float, n: int, rng: np.random.Generator) -> np.ndarray:

@@ -9,6 +9,7 @@ from lerobot.policies.utils import prepare_observation_for_inference
 from lerobot.utils.constants import OBS_IMAGES, OBS_STATE, OBS_STR
 from lerobot.utils.feature_utils import build_dataset_frame
 
+from lerobot_latentsafe.datasets.interruptions import Hand, Interruptions
 from lerobot_latentsafe.envs.franka import CAMERAS
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, STATE_NAMES, action_limits
@@ -19,56 +20,50 @@ OBSERVED = {
     **{f"{OBS_IMAGES}.{name}": {"dtype": "image"} for name in CAMERAS},
 }
 """What a policy is given of an observation."""
-CLOSING = 0.5
-"""Command of the fingers below which they are to hold something."""
 
 
 class PolicyOperator:
-    """Acts as a policy does that a filter overrides: what it does next it does in no other recording.
+    """Acts as a policy does that is interrupted: what it does next it does in no other recording.
 
-    Either by a filter; or, for want of one that is any good yet, now and then while the fingers close, by hold or by
-    the way down.
+    Either when a filter would override it; or, for want of one that is any good yet, now and then.
 
     Args:
         path: of the policy; folder, Hub id or committed name.
         fps: of the robot.
-        overridden: chance that an override begins at a step.
-        shield: path of a filter that overrides instead.
+        hand: what an interruption is like.
+        shield: path of a filter that says when to interrupt.
     """
 
-    def __init__(self, path: str, fps: int, overridden: float, shield: str | None = None):
-        self.limits = action_limits(fps)
+    def __init__(self, path: str, fps: int, hand: Hand, shield: str | None = None):
+        self.limits, self.hand, self.filter = action_limits(fps), hand, None
         if shield is None:
-            self.policy, self.overridden = BasePolicy(path, "cpu"), overridden
-            self.propose = self.policy.propose
-        else:
-            self.policy, self.overridden = LatentSafePolicy.from_pretrained(shield).eval(), 0.0
-            self.policy.attach(path)
-            self.propose = self.policy.select_action
+            self.policy = BasePolicy(path, "cpu")
+            return
+        self.filter = LatentSafePolicy.from_pretrained(shield).eval()
+        self.filter.config.mode = "monitor"
+        self.filter.attach(path)
+        self.policy = self.filter.base
 
     def begin(self, seed: int) -> None:
         """Start an episode; what follows depends on the seed and on what is seen."""
         torch.manual_seed(seed)
-        self.policy.reset()
-        self.rng, self.left, self.override = np.random.default_rng([9, seed]), 0, np.zeros(6)
-        self.gripper = 1.0
+        (self.filter or self.policy).reset()
+        self.interruptions = Interruptions(self.hand, self.limits, np.random.default_rng([9, seed]))
 
+    @torch.no_grad()
     def act(self, seen: Mapping[str, Any]) -> dict[str, float]:
         """The action for an observation of a LeRobot robot, clipped into its limits."""
         batch = prepare_observation_for_inference(build_dataset_frame(OBSERVED, seen, OBS_STR), torch.device("cpu"))
-        with torch.no_grad():
-            action = np.clip(self.propose(batch)[0].double().numpy(), *self.limits)
-        if self._interrupts():
-            action = np.append(self.override, self.gripper)
-            self.policy.replan(torch.from_numpy(action).float()[None])
-        self.gripper = action[6]
+        if self.filter is None:
+            proposed, unsafe = self.policy.propose(batch), None
+        else:
+            decision = self.filter.decide(batch)
+            proposed, unsafe = decision.proposed, decision.unsafe.item()
+        proposed = np.clip(proposed[0].double().numpy(), *self.limits)
+        action, interrupted = self.interruptions(proposed, unsafe)
+        executed = torch.from_numpy(action).float()[None]
+        if interrupted:
+            self.policy.replan(executed)
+        if self.filter is not None:
+            self.filter.shield.was_executed(executed)
         return dict(zip(ACTION_NAMES, action.tolist()))
-
-    def _interrupts(self) -> bool:
-        """Whether this step is an override's; one lasts 1 to 11 steps."""
-        if self.left == 0 and self.gripper < CLOSING and self.rng.random() < self.overridden:
-            self.left = int(self.rng.integers(2, 13))
-            down = self.rng.random() < 0.6
-            self.override = np.array([0, 0, down * self.rng.uniform(0.2, 1) * self.limits[0][2], 0, 0, 0])
-        self.left = max(0, self.left - 1)
-        return self.left > 0
