@@ -285,6 +285,7 @@ class Wrap:
     epsilon: float | None = None
     guard: int | None = None
     release: float | None = None
+    dwell: int | None = None
     law: str | None = None
     mode: str | None = None
     half: bool = False
@@ -293,12 +294,13 @@ class Wrap:
     """Keep what draws an RSSM's imagination for reports, two fifths of its weights."""
 
     def run(self) -> None:
+        from lerobot_latentsafe.configuration_latentsafe import DECIDES
         from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
         from lerobot_latentsafe.training import refuse_existing, save_filter
 
         refuse_existing(self.output_dir)
         policy = LatentSafePolicy.from_pretrained(self.policy.path)
-        policy.config.override(self, "epsilon", "guard", "release", "law", "mode")
+        policy.config.override(self, *DECIDES, "law", "mode")
         if not self.drawing:
             if not policy.world_model.draws:
                 raise ValueError(f"--drawing=false, but the {policy.config.world_model.type} world model draws nothing")
@@ -402,6 +404,7 @@ class EvalShield:
     epsilon: float | None = None
     guard: int | None = None
     release: float | None = None
+    dwell: int | None = None
     law: str | None = None
     """These override the filter's."""
     json: Path | None = None
@@ -412,6 +415,7 @@ class EvalShield:
     """Where to draw the trajectories, .png."""
 
     def run(self) -> None:
+        from lerobot_latentsafe.configuration_latentsafe import DECIDES
         from lerobot_latentsafe.evaluation.rollouts import provenance, write_json
         from lerobot_latentsafe.evaluation.shielding import compare
         from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
@@ -419,7 +423,7 @@ class EvalShield:
         if self.n_episodes < 1:
             raise ValueError(f"--n_episodes is {self.n_episodes}; expected at least 1")
         policy = LatentSafePolicy.from_pretrained(self.policy.path)
-        policy.config.override(self, "epsilon", "guard", "release", "law")
+        policy.config.override(self, *DECIDES, "law")
         if self.base_policy_path:
             policy.attach(self.base_policy_path)
         result = compare(policy, self.env, self.n_episodes, self.seed, self.n_videos if self.video else 0)
@@ -429,6 +433,7 @@ class EvalShield:
             "epsilon": policy.config.epsilon,
             "guard": policy.config.guard,
             "release": policy.config.release,
+            "dwell": policy.config.dwell,
             "law": policy.config.law,
             **provenance(seeds=[self.seed]),
         }
@@ -615,10 +620,12 @@ class Report:
     epsilon: float | None = None
     guard: int | None = None
     release: float | None = None
+    dwell: int | None = None
     law: str | None = None
     """These override the filter's."""
 
     def run(self) -> None:
+        from lerobot_latentsafe.configuration_latentsafe import DECIDES
         from lerobot_latentsafe.evaluation.filter_report import write_filter_report
         from lerobot_latentsafe.labeling.frames import DatasetFrames
         from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
@@ -628,7 +635,7 @@ class Report:
         if self.base_policy_path and self.env is None:
             raise ValueError("--base_policy_path runs a policy, but where? Give --env.type")
         policy = LatentSafePolicy.from_pretrained(self.policy.path).eval()
-        policy.config.override(self, "epsilon", "guard", "release", "law")
+        policy.config.override(self, *DECIDES, "law")
         if self.base_policy_path:
             policy.attach(self.base_policy_path)
         recorded = DatasetFrames(self.dataset.downloaded()) if self.dataset.repo_id else None

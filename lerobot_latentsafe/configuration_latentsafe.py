@@ -12,6 +12,8 @@ from lerobot_latentsafe.world_models import RSSMConfig, WorldModelConfig
 STAGES = ("untrained", "world_model", "reachability")
 MODES = ("filter", "monitor")
 LAWS = ("reachability", "risk", "plan", "margin")
+DECIDES = ("epsilon", "guard", "release", "dwell")
+"""Settings that say, with a law, when a filter acts and for how long."""
 
 
 class CriticTargetError(ValueError):

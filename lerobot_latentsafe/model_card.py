@@ -142,9 +142,12 @@ def make_model_card(
 
 def threshold(config: LatentSafeConfig) -> str:
     """What V must exceed, in words."""
-    if config.release <= config.epsilon:
-        return f"{config.epsilon:g}"
-    return f"{config.epsilon:g}; once the filter acts, {config.release:g}"
+    parts = []
+    if config.release > config.epsilon:
+        parts.append(f"{config.release:g}")
+    if config.dwell > 1:
+        parts.append(f"not before {config.dwell} steps")
+    return f"{config.epsilon:g}" + (f"; once the filter acts, {', '.join(parts)}" if parts else "")
 
 
 def _world_model(config: LatentSafeConfig) -> str:

@@ -139,6 +139,9 @@ def test_card_says_above_what_the_base_policy_is_released(policy):
     policy.config.epsilon, policy.config.release = 0.4, 0.5
     card = policy.generate_model_card("me/car", "latentsafe", None, None)
     assert "| epsilon | 0.4; once the filter acts, 0.5 |" in card.text
+    policy.config.dwell = 5
+    card = policy.generate_model_card("me/car", "latentsafe", None, None)
+    assert "| epsilon | 0.4; once the filter acts, 0.5, not before 5 steps |" in card.text
 
 
 def test_unknown_id_is_a_clear_error(hub):

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from lerobot_latentsafe.checkpoint import WEIGHTS, read_config, resolve_checkpoint
-from lerobot_latentsafe.configuration_latentsafe import LAWS
+from lerobot_latentsafe.configuration_latentsafe import DECIDES, LAWS
 from lerobot_latentsafe.envs.bag import BagScene
 from lerobot_latentsafe.envs.franka import CAMERAS
 from lerobot_latentsafe.evaluation.rollouts import paired_p_value, provenance, run_resumable, wilson
@@ -43,30 +43,30 @@ class FilterSetting:
     epsilon: float
     guard: int
     release: float
+    dwell: int
     fingerprint: str
 
     @classmethod
-    def of(
-        cls, path: str, law: str, epsilon: float | None = None, guard: int | None = None, release: float | None = None
-    ) -> "FilterSetting":  # fmt: skip
-        """Epsilon, guard and release are the filter's own unless given."""
+    def of(cls, path: str, law: str, **changed: float | None) -> "FilterSetting":
+        """Epsilon, guard, release and dwell are the filter's own unless given."""
         own = read_config(resolve_checkpoint(path))
-        epsilon, guard = own.epsilon if epsilon is None else epsilon, own.guard if guard is None else guard
-        return cls(path, law, epsilon, guard, own.release if release is None else release, fingerprint(path))
+        chosen = {name: getattr(own, name) if changed.get(name) is None else changed[name] for name in DECIDES}
+        return cls(path, law, **chosen, fingerprint=fingerprint(path))
 
     @classmethod
     def all(cls, paths: list[str], laws: list[str], options: object) -> list["FilterSetting"]:
         """Filters under the first law, and the first of them under the others, which are what it is compared with.
 
-        Epsilon, guard and release are those of a command line's options.
+        Epsilon, guard, release and dwell are those of a command line's options.
         """
         pairs = [(path, laws[0]) for path in paths] + [(paths[0], law) for law in laws[1:]]
-        return [cls.of(path, law, options.epsilon, options.guard, options.release) for path, law in pairs]
+        changed = {name: getattr(options, name) for name in DECIDES}
+        return [cls.of(path, law, **changed) for path, law in pairs]
 
     def load(self, base: str | None = None) -> LatentSafePolicy:
         """The filter, with the policy it is to shield, if any."""
         policy = LatentSafePolicy.from_pretrained(self.path).eval()
-        policy.config.override(self, "law", "epsilon", "guard", "release")
+        policy.config.override(self, "law", *DECIDES)
         if base is not None:
             policy.attach(base)
         return policy
@@ -79,6 +79,7 @@ def add_filter_options(parser: ArgumentParser, n: int) -> None:
     parser.add_argument("--epsilon", type=float)
     parser.add_argument("--guard", type=int)
     parser.add_argument("--release", type=float)
+    parser.add_argument("--dwell", type=int)
     parser.add_argument("--workers", type=int, default=1, help="processes")
 
 
@@ -92,7 +93,7 @@ def add_laws(parser: ArgumentParser) -> None:
 
 def in_use(settings: list[FilterSetting]) -> dict[str, dict]:
     """Path -> what a table notes of a filter beside its rates."""
-    return {s.path: {"epsilon": s.epsilon, "guard": s.guard, "release": s.release} for s in settings}
+    return {setting.path: {name: getattr(setting, name) for name in DECIDES} for setting in settings}
 
 
 def as_job(setting: FilterSetting | None) -> dict | None:

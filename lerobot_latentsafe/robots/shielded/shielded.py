@@ -15,6 +15,7 @@ from lerobot.robots.utils import make_robot_from_config
 from lerobot.utils.constants import OBS_IMAGES, OBS_STATE, OBS_STR
 from lerobot.utils.feature_utils import build_dataset_frame
 
+from lerobot_latentsafe.configuration_latentsafe import DECIDES
 from lerobot_latentsafe.datasets.frame_cache import check_proportions
 from lerobot_latentsafe.filter import FilterDecision, Reason
 from lerobot_latentsafe.robots.announcements import Announcements
@@ -49,7 +50,7 @@ class LatentSafeShielded(Robot):
         self.inner = make_robot_from_config(config.inner)
         self.name = self.robot_type = self.inner.name
         self.filter = LatentSafePolicy.from_pretrained(config.filter).eval()
-        self.filter.config.override(config, "mode", "epsilon", "guard", "release")
+        self.filter.config.override(config, "mode", *DECIDES)
         if config.device:
             self.filter.to(config.device)
         self.filter.require_stage(self.filter.needed_stage)
