@@ -286,6 +286,8 @@ class Wrap:
     guard: int | None = None
     release: float | None = None
     dwell: int | None = None
+    retreat: dict[str, float] | None = None
+    """Command -> robot units a step, such as {delta_z.pos: -0.006}: what acts in the critic's place."""
     law: str | None = None
     mode: str | None = None
     half: bool = False
@@ -300,7 +302,7 @@ class Wrap:
 
         refuse_existing(self.output_dir)
         policy = LatentSafePolicy.from_pretrained(self.policy.path)
-        policy.config.override(self, *DECIDES, "law", "mode")
+        policy.config.override(self, *DECIDES, "retreat", "law", "mode")
         if not self.drawing:
             if not policy.world_model.draws:
                 raise ValueError(f"--drawing=false, but the {policy.config.world_model.type} world model draws nothing")

@@ -43,15 +43,17 @@ class LatentSafeConfig(PreTrainedConfig):
             -risk, so SQRL's threshold of 0.1 is an epsilon of -0.1.
         release: once the filter has acted, the base policy acts again only where V is above this, if that is more than
             epsilon. A policy that is given its way at every second step shakes what the fallback holds.
-        dwell: steps for which the filter acts at least, once it does: a fallback of a single step leads nowhere.
+        dwell: steps for which the filter acts at least, once it does: a fallback of a single step leads nowhere. What
+            the first frame of an episode says, without memory, binds for that step only.
+        retreat: a manoeuvre that is known to lead back to safety, command -> robot units a step, such as
+            {delta_z.pos: -0.006}: it acts in the critic's place, and V is the best of it, of standing still and of the
+            critic's policy. V, the worst of all times, is the same for waiting at a doubtful place as for leaving it.
         guard: steps for which the proposed action is imagined held before V is asked. 1 is the paper's law; more give
             room for what the world model gets wrong, as time, which a saturated margin cannot.
         calibration: the evidence epsilon was chosen on; written by `latentsafe calibrate`.
         evaluation: what was measured -> the rate in words; written by `latentsafe push --results=...` for the card.
         lookahead: steps of imagination before the critic's value is read, 0 to 25: V and the fallback are the best of
             the critic's policy and of holding each action. 0 is the critic alone, and the cheapest.
-        tie: of these policies, those whose V is within this of the best count as equal, and the one that ends best
-            acts. V is the worst of all times: waiting at a doubtful place is worth what leaving it is.
         samples: next latents drawn from a stochastic world model, of which the worst counts; 0 imagines its mean or
             mode. If any, the critic is trained on drawn latents, too.
         law: what V is: `reachability`; or a baseline: `risk`, which needs a critic trained for it, `plan`, which
@@ -98,12 +100,12 @@ class LatentSafeConfig(PreTrainedConfig):
     epsilon: float = 0.0
     release: float = -1.0
     dwell: int = 1
+    retreat: dict[str, float] = field(default_factory=dict)
     guard: int = 1
     samples: int = 0
     calibration: dict[str, float] = field(default_factory=dict)
     evaluation: dict[str, str] = field(default_factory=dict)
     lookahead: int = 15
-    tie: float = 0.0
     law: str = "reachability"
     mode: str = "filter"
     deadline_ms: float | None = None
@@ -151,8 +153,6 @@ class LatentSafeConfig(PreTrainedConfig):
             raise ValueError(f"--policy.guard is {self.guard}; expected 1 (the paper's law) to 25 steps")
         if self.dwell < 1:
             raise ValueError(f"--policy.dwell is {self.dwell}; expected at least 1 step")
-        if not 0 <= self.tie < 1:
-            raise ValueError(f"--policy.tie is {self.tie}; expected 0 (V alone decides who acts) to less than 1")
         if not 0 < self.fallback_pace <= 1:
             raise ValueError(f"--policy.fallback_pace is {self.fallback_pace}; expected more than 0, at most 1 (all)")
         if not self.release < 1:

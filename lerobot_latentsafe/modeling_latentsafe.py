@@ -80,6 +80,7 @@ class LatentSafePolicy(PreTrainedPolicy):
         kept = torch.tensor([name in config.kept_commands for name in config.action_names])
         self.register_buffer("kept", kept, persistent=False)
         self.critic = self.new_critic(candidates)
+        self.retreat  # noqa: B018 - one that cannot be is refused now
         self._ddp_params_and_buffers_to_ignore = self._never_averaged()
         self._base: list[BasePolicy] = []  # in a list, so that its weights are not ours
         self.shield = Shield(self)
@@ -119,6 +120,25 @@ class LatentSafePolicy(PreTrainedPolicy):
     def first_action(self, action: Tensor) -> Tensor:
         """What counts as having led to the first frame of an episode: no motion, kept commands as in `action`."""
         return torch.where(self.kept, action, 0.0)
+
+    @property
+    def retreat(self) -> Tensor | None:
+        """The manoeuvre of `config.retreat` (1, A) in [-1, 1], if there is one."""
+        names = self.config.action_names
+        if not self.config.retreat:
+            return None
+        if unknown := [name for name in self.config.retreat if name not in names]:
+            raise ValueError(f"--policy.retreat moves {', '.join(unknown)}; the actions are {', '.join(names)}")
+        action = self.hold_action(1)
+        for name, motion in self.config.retreat.items():
+            action[0, names.index(name)] = motion
+        inside = (action >= self.action_low) & (action <= self.action_high)
+        if not inside.all():
+            raise ValueError(
+                f"--policy.retreat {self.config.retreat} leaves the range trained on: "
+                f"{self.action_low.tolist()} to {self.action_high.tolist()}"
+            )
+        return self.normalise_action(action)
 
     def normalise_state(self, state: Tensor) -> Tensor:
         return (state.float() - self.state_mean) / self.state_std
@@ -199,8 +219,11 @@ class LatentSafePolicy(PreTrainedPolicy):
             margin = self.imagination.margin(latent)
             return margin, self.imagination.complete(latent, still.expand(len(margin), -1))
         critic = self.critic if self.config.law in BACKUPS else None
-        held, config = self.critic.held_actions(still), self.config
-        return look_ahead(self.imagination, latent, held, config.lookahead, critic, config.tie)
+        held = self.critic.held_actions(still) if self.retreat is None else torch.cat([still, self.retreat])
+        value, action = look_ahead(self.imagination, latent, held, self.config.lookahead, critic)
+        if self.retreat is not None:
+            action = self.imagination.complete(latent, self.retreat.expand(len(action), -1))
+        return value, action
 
     @property
     def needed_stage(self) -> str:

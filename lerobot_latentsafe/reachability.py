@@ -256,9 +256,8 @@ class SafetyCritic(nn.Module):
 
 @torch.no_grad()
 def look_ahead(
-    imagination: Imagination, latent: Latent, held: Tensor, horizon: int, critic: SafetyCritic | None = None,
-    tie: float = 0.0,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
+    imagination: Imagination, latent: Latent, held: Tensor, horizon: int, critic: SafetyCritic | None = None
+) -> tuple[Tensor, Tensor]:
     """V by imagining what could be done from here: the best of a few policies, each followed for `horizon` steps.
 
     The policies hold one action each; given a critic, its fallback policy is one more, and its value stands for all
@@ -268,10 +267,9 @@ def look_ahead(
     Args:
         latent: N latents.
         held: (K, A) actions in [-1, 1].
-        tie: policies that are worse than the best by no more than this count as equal to it.
 
     Returns:
-        V (N,), and the first action (N, A) of the best policy; of several, of the one that ends best.
+        V (N,), and the first action of the best policy (N, A).
     """
     if horizon == 0 and critic is not None:
         features = imagination.features(latent)
@@ -279,7 +277,6 @@ def look_ahead(
         return critic.value(features, imagination.margin(latent)), action
     now = imagination.margin(latent)
     n, n_policies = len(now), len(held) + (critic is not None)
-    end = now.repeat(n_policies)
     z = map_latent(latent, lambda t: t.repeat(n_policies, *[1] * (t.dim() - 1)))
     worst, over = now.repeat(n_policies), torch.zeros(n * n_policies, dtype=torch.bool, device=now.device)
     action = first = held.repeat_interleave(n, 0)
@@ -290,17 +287,13 @@ def look_ahead(
         action = imagination.complete(z, action)
         first = action if t == 0 else first
         z = imagination.step(z, action)
-        end = torch.where(over, end, imagination.margin(z))
-        worst = torch.minimum(worst, end)
+        worst = torch.where(over, worst, torch.minimum(worst, imagination.margin(z)))
         over = over | imagination.ended(z)
     if critic is not None:
-        end = torch.where(over, end, critic.value(imagination.features(z), end))
-        worst = torch.minimum(worst, end)
-    worst, end = worst.view(n_policies, n), end.view(n_policies, n)
-    best, chosen = worst.max(0)
-    if tie:
-        chosen = torch.where(worst >= best - tie, end, -torch.inf).argmax(0)
-    return best, first.view(n_policies, n, -1)[chosen, torch.arange(n, device=now.device)]
+        after = critic.value(imagination.features(z), imagination.margin(z))
+        worst = torch.where(over, worst, torch.minimum(worst, after))
+    best = worst.view(n_policies, n).max(0)
+    return best.values, first.view(n_policies, n, -1)[best.indices, torch.arange(n, device=now.device)]
 
 
 def discount(progress: float, config: ReachabilityConfig) -> float:

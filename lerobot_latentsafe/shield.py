@@ -97,8 +97,8 @@ class Shield:
         decision = least_restrictive(
             proposed, fallback, value, margin, self._threshold(), fault, monitor=config.mode == "monitor"
         )
-        acted = 0 if self.acted is None else self.acted
-        self.acted = (acted + 1) * decision.intervened
+        # What the first frame says, without memory, binds for that step only.
+        self.acted = (config.dwell if self.acted is None else self.acted + 1) * decision.intervened
         self.latent, self.decision, self.decided_at = latent, decision, finished
         self.was_executed(decision.action)
         self._tell(decision)
@@ -146,7 +146,7 @@ class Shield:
     def _no_stricter_than(self, other: "Shield") -> bool:
         """Whether the other has our weights, acts, and passes nothing that we would not."""
         own, theirs = self.filter.config, other.filter.config
-        alike = (*TRAINED, "law", "lookahead", "tie", "guard", "samples")
+        alike = (*TRAINED, "law", "lookahead", "guard", "samples", "retreat")
         same = all(getattr(own, name) == getattr(theirs, name) for name in alike)
         laxer = any(getattr(theirs, name) < getattr(own, name) for name in ("epsilon", "release", "dwell"))
         if not same or theirs.mode == "monitor" or laxer:

@@ -176,19 +176,6 @@ def untrained_critic(bias=0.0):
     return critic
 
 
-class Shaken(WindyChain):
-    """Moves right by the action; whoever moves at once by more than .5 is worse for it by .3 at every other step."""
-
-    def step(self, latent, action):
-        return {"x": latent["x"] + 0.1 * action, "shaken": (action > 0.5) & ~latent.get("shaken", action > 9)}
-
-    def margin(self, latent):
-        return latent["x"][:, 0] - 0.3 * latent.get("shaken", latent["x"] > 9)[:, 0].float()
-
-    def ended(self, latent):
-        return torch.zeros(len(latent["x"]), dtype=torch.bool)
-
-
 def test_look_ahead_finds_the_exact_safe_set_without_a_trained_critic():
     x = torch.linspace(-0.9, 0.9, 37)[:, None]
     value, action = look_ahead(WindyChain(), {"x": x}, torch.tensor([[-1.0], [1.0]]), 20)
@@ -214,20 +201,6 @@ def test_look_ahead_leaves_what_comes_after_to_the_critic(bias, safe):
 def test_look_ahead_keeps_what_is_not_finite():
     value, _ = look_ahead(WindyChain(), {"x": torch.tensor([[math.nan], [0.8]])}, torch.tensor([[-1.0], [1.0]]), 3)
     assert value.isnan().tolist() == [True, False]
-
-
-def test_of_policies_that_are_worth_the_same_the_one_that_ends_best_acts():
-    """The worst of all times is the present for whoever does not fall; to wait is worth what leaving is."""
-    latent, held = {"x": torch.tensor([[0.5], [-0.4]])}, torch.tensor([[0.0], [0.2], [1.0]])
-    waits, leaves, hurries = 0, 1, 2
-    value, action = look_ahead(Shaken(), latent, held, 2)
-    assert action.squeeze(-1).tolist() == held[[waits, waits], 0].tolist()
-    for tie, chosen in ((0.05, leaves), (0.5, hurries)):
-        same, action = look_ahead(Shaken(), latent, held, 2, tie=tie)
-        torch.testing.assert_close(same, value)
-        assert action[0] == held[chosen]
-    values, action = look_ahead(Shaken(), {"x": torch.tensor([[math.nan]])}, held, 3, tie=0.1)
-    assert values.isnan().all() and action.isfinite().all()
 
 
 def test_held_actions_move_only_what_varies():
