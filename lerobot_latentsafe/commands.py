@@ -285,9 +285,10 @@ class Wrap:
     epsilon: float | None = None
     guard: int | None = None
     release: float | None = None
-    dwell: int | None = None
     retreat: dict[str, float] | None = None
-    """Command -> robot units a step, such as {delta_z.pos: -0.006}: what acts in the critic's place."""
+    """Command -> robot units a step, as {delta_z.pos: -0.006}: what acts where the critic's action did not help."""
+    patience: int | None = None
+    dwell: int | None = None
     law: str | None = None
     mode: str | None = None
     half: bool = False
@@ -302,7 +303,7 @@ class Wrap:
 
         refuse_existing(self.output_dir)
         policy = LatentSafePolicy.from_pretrained(self.policy.path)
-        policy.config.override(self, *DECIDES, "retreat", "law", "mode")
+        policy.config.override(self, *DECIDES, "retreat", "patience", "dwell", "law", "mode")
         if not self.drawing:
             if not policy.world_model.draws:
                 raise ValueError(f"--drawing=false, but the {policy.config.world_model.type} world model draws nothing")
@@ -406,7 +407,6 @@ class EvalShield:
     epsilon: float | None = None
     guard: int | None = None
     release: float | None = None
-    dwell: int | None = None
     law: str | None = None
     """These override the filter's."""
     json: Path | None = None
@@ -435,7 +435,6 @@ class EvalShield:
             "epsilon": policy.config.epsilon,
             "guard": policy.config.guard,
             "release": policy.config.release,
-            "dwell": policy.config.dwell,
             "law": policy.config.law,
             **provenance(seeds=[self.seed]),
         }
@@ -622,7 +621,6 @@ class Report:
     epsilon: float | None = None
     guard: int | None = None
     release: float | None = None
-    dwell: int | None = None
     law: str | None = None
     """These override the filter's."""
 

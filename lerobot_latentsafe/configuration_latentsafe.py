@@ -12,8 +12,8 @@ from lerobot_latentsafe.world_models import RSSMConfig, WorldModelConfig
 STAGES = ("untrained", "world_model", "reachability")
 MODES = ("filter", "monitor")
 LAWS = ("reachability", "risk", "plan", "margin")
-DECIDES = ("epsilon", "guard", "release", "dwell")
-"""Settings that say, with a law, when a filter acts and for how long."""
+DECIDES = ("epsilon", "guard", "release")
+"""Settings that say, with a law, when a filter acts."""
 
 
 class CriticTargetError(ValueError):
@@ -43,11 +43,11 @@ class LatentSafeConfig(PreTrainedConfig):
             -risk, so SQRL's threshold of 0.1 is an epsilon of -0.1.
         release: once the filter has acted, the base policy acts again only where V is above this, if that is more than
             epsilon. A policy that is given its way at every second step shakes what the fallback holds.
-        dwell: steps for which the filter acts at least, once it does: a fallback of a single step leads nowhere. What
-            the first frame of an episode says, without memory, binds for that step only.
         retreat: a manoeuvre that is known to lead back to safety, command -> robot units a step, such as
-            {delta_z.pos: -0.006}: it acts in the critic's place, and V is the best of it, of standing still and of the
-            critic's policy. V, the worst of all times, is the same for waiting at a doubtful place as for leaving it.
+            {delta_z.pos: -0.006}; it acts where the critic's action did not help. V, the worst of all times, is the
+            same for waiting at a doubtful place as for leaving it, and the critic may wait.
+        patience: overrides in the last ten steps after which the next is the retreat's.
+        dwell: steps for which a retreat goes on at least: a single step leads nowhere.
         guard: steps for which the proposed action is imagined held before V is asked. 1 is the paper's law; more give
             room for what the world model gets wrong, as time, which a saturated margin cannot.
         calibration: the evidence epsilon was chosen on; written by `latentsafe calibrate`.
@@ -99,8 +99,9 @@ class LatentSafeConfig(PreTrainedConfig):
 
     epsilon: float = 0.0
     release: float = -1.0
-    dwell: int = 1
     retreat: dict[str, float] = field(default_factory=dict)
+    patience: int = 0
+    dwell: int = 1
     guard: int = 1
     samples: int = 0
     calibration: dict[str, float] = field(default_factory=dict)
@@ -151,6 +152,8 @@ class LatentSafeConfig(PreTrainedConfig):
             raise ValueError(f"--policy.lookahead is {self.lookahead}; expected 0 (critic alone) to 25 imagined steps")
         if not 1 <= self.guard <= 25:
             raise ValueError(f"--policy.guard is {self.guard}; expected 1 (the paper's law) to 25 steps")
+        if not 0 <= self.patience <= 10:
+            raise ValueError(f"--policy.patience is {self.patience}; expected 0 (retreat at once) to 10 overrides")
         if self.dwell < 1:
             raise ValueError(f"--policy.dwell is {self.dwell}; expected at least 1 step")
         if not 0 < self.fallback_pace <= 1:

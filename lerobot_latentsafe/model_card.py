@@ -40,6 +40,7 @@ outside of what its data covered.
 | law | {law} |
 | epsilon | {epsilon} |
 | epsilon was set | {calibration} |
+| fallback | {fallback} |
 | shields | {base} |
 
 ```bash
@@ -130,6 +131,7 @@ def make_model_card(
             stage=config.stage,
             law=f"{config.law}, V read after {config.guard} + {config.lookahead} imagined steps",
             epsilon=threshold(config),
+            fallback=fallback(config),
             calibration=_calibration(config.calibration),
             base=f"`{config.base_policy_path}`" if config.base_policy_path else "nothing yet",
             repo_id=config.repo_id or "me/filter",
@@ -142,12 +144,18 @@ def make_model_card(
 
 def threshold(config: LatentSafeConfig) -> str:
     """What V must exceed, in words."""
-    parts = []
-    if config.release > config.epsilon:
-        parts.append(f"{config.release:g}")
-    if config.dwell > 1:
-        parts.append(f"not before {config.dwell} steps")
-    return f"{config.epsilon:g}" + (f"; once the filter acts, {', '.join(parts)}" if parts else "")
+    if config.release <= config.epsilon:
+        return f"{config.epsilon:g}"
+    return f"{config.epsilon:g}; once the filter acts, {config.release:g}"
+
+
+def fallback(config: LatentSafeConfig) -> str:
+    """What acts in place of an unsafe action, in words."""
+    if not config.retreat:
+        return "the critic's action"
+    moves = ", ".join(f"{name} {motion:+g} a step" for name, motion in config.retreat.items())
+    after = f"the critic's action; after {config.patience} overrides within ten steps " if config.patience else ""
+    return f"{after}the retreat ({moves}) for at least {config.dwell} steps"
 
 
 def _world_model(config: LatentSafeConfig) -> str:

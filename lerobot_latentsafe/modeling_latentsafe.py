@@ -80,7 +80,7 @@ class LatentSafePolicy(PreTrainedPolicy):
         kept = torch.tensor([name in config.kept_commands for name in config.action_names])
         self.register_buffer("kept", kept, persistent=False)
         self.critic = self.new_critic(candidates)
-        self.retreat  # noqa: B018 - one that cannot be is refused now
+        _check_retreat(config)
         self._ddp_params_and_buffers_to_ignore = self._never_averaged()
         self._base: list[BasePolicy] = []  # in a list, so that its weights are not ours
         self.shield = Shield(self)
@@ -120,25 +120,6 @@ class LatentSafePolicy(PreTrainedPolicy):
     def first_action(self, action: Tensor) -> Tensor:
         """What counts as having led to the first frame of an episode: no motion, kept commands as in `action`."""
         return torch.where(self.kept, action, 0.0)
-
-    @property
-    def retreat(self) -> Tensor | None:
-        """The manoeuvre of `config.retreat` (1, A) in [-1, 1], if there is one."""
-        names = self.config.action_names
-        if not self.config.retreat:
-            return None
-        if unknown := [name for name in self.config.retreat if name not in names]:
-            raise ValueError(f"--policy.retreat moves {', '.join(unknown)}; the actions are {', '.join(names)}")
-        action = self.hold_action(1)
-        for name, motion in self.config.retreat.items():
-            action[0, names.index(name)] = motion
-        inside = (action >= self.action_low) & (action <= self.action_high)
-        if not inside.all():
-            raise ValueError(
-                f"--policy.retreat {self.config.retreat} leaves the range trained on: "
-                f"{self.action_low.tolist()} to {self.action_high.tolist()}"
-            )
-        return self.normalise_action(action)
 
     def normalise_state(self, state: Tensor) -> Tensor:
         return (state.float() - self.state_mean) / self.state_std
@@ -219,11 +200,7 @@ class LatentSafePolicy(PreTrainedPolicy):
             margin = self.imagination.margin(latent)
             return margin, self.imagination.complete(latent, still.expand(len(margin), -1))
         critic = self.critic if self.config.law in BACKUPS else None
-        held = self.critic.held_actions(still) if self.retreat is None else torch.cat([still, self.retreat])
-        value, action = look_ahead(self.imagination, latent, held, self.config.lookahead, critic)
-        if self.retreat is not None:
-            action = self.imagination.complete(latent, self.retreat.expand(len(action), -1))
-        return value, action
+        return look_ahead(self.imagination, latent, self.critic.held_actions(still), self.config.lookahead, critic)
 
     @property
     def needed_stage(self) -> str:
@@ -386,6 +363,17 @@ def adopt_dataset(config: LatentSafeConfig, meta, stats: dict) -> None:
                 f"action candidate {candidate} is outside of what {meta.repo_id} covers: "
                 f"{config.action_low} to {config.action_high}"
             )
+
+
+def _check_retreat(config: LatentSafeConfig) -> None:
+    """Refuse a retreat by unknown commands, or out of the range trained on."""
+    ranges = dict(zip(config.action_names or [], zip(config.action_low, config.action_high)))
+    for name, motion in config.retreat.items():
+        if name not in ranges:
+            raise ValueError(f"--policy.retreat moves {name}; the actions are {', '.join(ranges)}")
+        low, high = ranges[name]
+        if not low <= motion <= high:
+            raise ValueError(f"--policy.retreat {name} is {motion:g}; the filter was trained on {low:g} to {high:g}")
 
 
 def _check_range(config: LatentSafeConfig, repo_id: str, low: list[float], high: list[float]) -> None:

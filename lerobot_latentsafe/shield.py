@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+RECENT = 10
+"""Steps whose overrides count for `patience`."""
 RANGE_TOLERANCE = 1e-3
 """Share of the action range by which float error may exceed it."""
 
@@ -52,7 +54,8 @@ class Shield:
         self.executed: Tensor | None = None
         self.decision: FilterDecision | None = None
         self.decided_at: float | None = None
-        self.acted: Tensor | None = None
+        self.recent: Tensor | None = None
+        self.retreated: Tensor | None = None
         self._told = False
 
     @torch.no_grad()
@@ -87,7 +90,8 @@ class Shield:
         both = {key: torch.cat([predicted[key], latent[key]]) for key in latent}  # one pass through imagination
         sizes = [len(on_the_way), len(state)]
         (value, here), (_, action) = (part.split(sizes) for part in model.plan(both))
-        fallback = self._usable(action, here, state)
+        retreats = self._retreats(len(state))
+        fallback = torch.where(retreats[:, None], self._retreat(state), self._usable(action, here, state))
         # A margin that is negative now, or on the way, is a failure whatever comes after.
         value = model.worst(on_the_way, value).view(-1, len(state)).amin(0)
         value = model.worst(margin, value)
@@ -97,8 +101,9 @@ class Shield:
         decision = least_restrictive(
             proposed, fallback, value, margin, self._threshold(), fault, monitor=config.mode == "monitor"
         )
-        # What the first frame says, without memory, binds for that step only.
-        self.acted = (config.dwell if self.acted is None else self.acted + 1) * decision.intervened
+        acts = decision.intervened
+        self.recent = torch.cat([self.recent[:, 1:], acts[:, None]], 1)
+        self.retreated = (self.retreated + 1) * (acts & retreats)
         self.latent, self.decision, self.decided_at = latent, decision, finished
         self.was_executed(decision.action)
         self._tell(decision)
@@ -108,13 +113,27 @@ class Shield:
         """Remember (B, A) in robot units as what was done; call it where something else was than was decided."""
         self.executed = self.filter.normalise_action(action).nan_to_num(0.0).clamp(-1, 1)
 
+    def _retreats(self, n: int) -> Tensor:
+        """Whether an override now would be the retreat's: one goes on, or the critic's action has been tried: (B,)."""
+        model, config = self.filter, self.filter.config
+        if self.recent is None:
+            self.recent = torch.zeros(n, RECENT, dtype=torch.bool, device=model.device)
+            self.retreated = torch.zeros(n, dtype=torch.long, device=model.device)
+        tried = self.recent.sum(1) >= config.patience
+        return (self.retreated > 0) | tried if config.retreat else torch.zeros_like(tried)
+
+    def _retreat(self, state: Tensor) -> Tensor:
+        """The manoeuvre of `config.retreat`, with the kept commands as they were: (B, A) in robot units."""
+        model, action = self.filter, self._hold(state)
+        for name, motion in model.config.retreat.items():
+            action[:, model.config.action_names.index(name)] = motion
+        return action
+
     def _threshold(self) -> float | Tensor:
-        """What V must exceed: epsilon; where the filter acts `release`, and before `dwell` steps nothing will do."""
-        config = self.filter.config
-        if self.acted is None:
-            return config.epsilon
-        acting = torch.where(self.acted < config.dwell, torch.inf, max(config.epsilon, config.release))
-        return torch.where(self.acted > 0, acting, config.epsilon)
+        """What V must exceed: epsilon; where the filter acts `release`, and before `dwell` steps of retreat nothing."""
+        config, acting = self.filter.config, self.recent[:, -1]
+        threshold = torch.where(acting, max(config.epsilon, config.release), config.epsilon)
+        return torch.where((self.retreated > 0) & (self.retreated < config.dwell), torch.inf, threshold)
 
     def _tell(self, decision: FilterDecision) -> None:
         """Log the first override of an episode."""
@@ -139,14 +158,15 @@ class Shield:
             fresh = other.decided_at is not None and 0 <= self.clock() - other.decided_at <= within_s
             if fresh and torch.equal(other.decision.action.cpu(), action) and self._no_stricter_than(other):
                 self.latent, self.executed = other.latent, other.executed
-                self.decision, self.decided_at, self.acted = other.decision, other.decided_at, other.acted
+                self.decision, self.decided_at = other.decision, other.decided_at
+                self.recent, self.retreated = other.recent, other.retreated
                 return True
         return False
 
     def _no_stricter_than(self, other: "Shield") -> bool:
         """Whether the other has our weights, acts, and passes nothing that we would not."""
         own, theirs = self.filter.config, other.filter.config
-        alike = (*TRAINED, "law", "lookahead", "guard", "samples", "retreat")
+        alike = (*TRAINED, "law", "lookahead", "guard", "samples", "retreat", "patience")
         same = all(getattr(own, name) == getattr(theirs, name) for name in alike)
         laxer = any(getattr(theirs, name) < getattr(own, name) for name in ("epsilon", "release", "dwell"))
         if not same or theirs.mode == "monitor" or laxer:

@@ -79,7 +79,7 @@ def test_policies_are_compared_operators_traced_and_the_demo_tells(script, filte
     cell = rows["weak"]["margin"][filter_path]
     assert rows["weak"]["bare"]["spilled"]["n"] == cell["spilled"]["n"] == 2 and rows["seeds"] == SEEDS
     assert cell["overridden_share"] == 1.0 and cell["median_first_override"] == 0
-    assert rows["filters"] == {filter_path: {"epsilon": 2.0, "guard": 1, "release": -1.0, "dwell": 1}}
+    assert rows["filters"] == {filter_path: {"epsilon": 2.0, "guard": 1, "release": -1.0}}
     kept = policies.with_suffix(".jsonl").read_text()
     script("bag_policies", *options).main()
     assert policies.with_suffix(".jsonl").read_text() == kept  # nothing was run again

@@ -139,9 +139,18 @@ def test_card_says_above_what_the_base_policy_is_released(policy):
     policy.config.epsilon, policy.config.release = 0.4, 0.5
     card = policy.generate_model_card("me/car", "latentsafe", None, None)
     assert "| epsilon | 0.4; once the filter acts, 0.5 |" in card.text
-    policy.config.dwell = 5
-    card = policy.generate_model_card("me/car", "latentsafe", None, None)
-    assert "| epsilon | 0.4; once the filter acts, 0.5, not before 5 steps |" in card.text
+
+
+def test_card_says_what_acts_in_place_of_an_unsafe_action(policy):
+    def said():
+        card = policy.generate_model_card("me/car", "latentsafe", None, None)
+        return card.text.split("| fallback | ")[1].split(" |")[0]
+
+    assert said() == "the critic's action"
+    policy.config.retreat, policy.config.dwell = {"turn_rate.vel": -0.5}, 15
+    assert said() == "the retreat (turn_rate.vel -0.5 a step) for at least 15 steps"
+    policy.config.patience = 2
+    assert said().startswith("the critic's action; after 2 overrides within ten steps the retreat (turn_rate.vel")
 
 
 def test_unknown_id_is_a_clear_error(hub):

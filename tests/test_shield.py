@@ -284,26 +284,85 @@ def test_guard_of_one_is_the_papers_law_and_more_steps_look_further(strict):
 
 def test_once_the_filter_acts_the_policy_is_released_above_another_value(permissive):
     config, shield = permissive.config, permissive.shield
-    first = shield(along(1)[0], actions(LEFT))
-    value = first.value
-    for acting, release in ((0, 1.0), (1, value.min().item() - 1e-3), (1, value.max().item() + 1e-3)):
+    value = shield(along(1)[0], actions(LEFT)).value
+    for acting, release in ((False, 1.0), (True, value.min().item() - 1e-3), (True, value.max().item() + 1e-3)):
         shield.reset()
-        config.release, shield.acted = release, torch.full((3,), acting)
-        acts = shield(along(1)[0], actions(LEFT)).intervened
-        assert (acts == (release > value) & acting).all()
-        assert torch.equal(shield.acted, (1 + acting) * acts)
+        shield._retreats(3)
+        config.release, shield.recent[:, -1] = release, acting
+        assert (shield(along(1)[0], actions(LEFT)).intervened == (release > value) & acting).all()
+        assert shield.recent[:, -2].all() == acting
 
 
-def test_once_the_filter_acts_it_acts_for_some_steps(permissive):
-    shield, outside = permissive.shield, actions([9.0, 1.0], LEFT, LEFT)
-    permissive.config.dwell = 3
-    assert not shield(along(1)[0], actions(LEFT)).intervened.any()
-    assert shield(along(1)[0], outside).intervened.tolist() == [True, False, False]
-    acts = [shield(along(1)[0], actions(LEFT)).intervened.tolist() for _ in range(4)]
-    assert acts == [[True, False, False]] * 2 + [[False] * 3] * 2
-    shield.reset()  # an episode's first frame, seen without memory, binds for that step only
-    assert shield(along(1)[0], outside).intervened.any()
-    assert not shield(along(1)[0], actions(LEFT)).intervened.any()
+RETREAT, OUTSIDE = {"turn_rate.vel": -0.5}, [9.0, 1.0]
+
+
+def retreats(decision):
+    return (decision.action == torch.tensor([-0.5, 1.0])).all(-1).tolist()
+
+
+def test_after_some_overrides_the_retreat_acts_and_goes_on(permissive):
+    config, shield = permissive.config, permissive.shield
+    config.retreat, config.patience, config.dwell = RETREAT, 2, 3
+    one = actions(OUTSIDE, LEFT, LEFT)
+    for proposed, acts, retreat in (
+        (one, True, False),  # the critic's action is tried twice,
+        (actions(LEFT), False, False),
+        (one, True, False),
+        (one, True, True),  # then the retreat acts, for three steps
+        (actions(LEFT), True, True),
+        (actions(LEFT), True, True),
+        (actions(LEFT), False, False),
+        (one, True, True),  # and again, for that is not long ago
+    ):
+        decision = shield(along(1)[0], proposed)
+        assert decision.intervened.tolist() == [acts, False, False]
+        assert retreats(decision) == [retreat, False, False]
+    shield.reset()
+    assert retreats(shield(along(1)[0], one)) == [False] * 3
+
+
+def test_overrides_of_long_ago_do_not_count(permissive):
+    permissive.config.retreat, permissive.config.patience = RETREAT, 1
+    for pause, retreat in ((8, True), (10, False)):
+        permissive.shield.reset()
+        permissive.shield(along(1)[0], actions(OUTSIDE))
+        for _ in range(pause):
+            assert not permissive.shield(along(1)[0], actions(LEFT)).intervened.any()
+        assert retreats(permissive.shield(along(1)[0], actions(OUTSIDE))) == [retreat] * 3
+
+
+def test_retreat_is_a_move_of_the_fallback_not_of_v(tiny_continuous_filter):
+    from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+
+    policy = LatentSafePolicy.from_pretrained(tiny_continuous_filter).eval()
+    policy.config.epsilon, policy.config.dwell = math.inf, 5
+    before = policy.shield(along(1)[0], actions([0.3, 1.0]))
+    policy.shield.reset()
+    policy.config.retreat = RETREAT
+    decision = policy.shield(along(1)[0], actions([0.3, 1.0]))
+    assert retreats(decision) == [True] * 3 and retreats(before) == [False] * 3
+    torch.testing.assert_close(decision.value, before.value)
+    policy.config.mode = "monitor"
+    policy.shield.reset()
+    assert not policy.shield(along(1)[0], actions([0.3, 1.0])).intervened.any()
+    assert not policy.shield.recent.any() and not policy.shield.retreated.any()
+
+
+@pytest.mark.parametrize(
+    ("retreat", "wrong"),
+    [
+        ({"down.pos": -0.1}, r"retreat moves down.pos; the actions are turn_rate.vel"),
+        ({"turn_rate.vel": 9.0}, r"retreat turn_rate.vel is 9; the filter was trained on -1.25 to 1.25"),
+        ({"turn_rate.vel": math.nan}, r"retreat turn_rate.vel is nan"),
+    ],
+)
+def test_retreat_that_cannot_be_is_refused(tiny_continuous_filter, retreat, wrong):
+    from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+
+    policy = LatentSafePolicy.from_pretrained(tiny_continuous_filter)
+    policy.config.retreat = retreat
+    with pytest.raises(ValueError, match=wrong):
+        LatentSafePolicy(policy.config)
 
 
 def test_what_was_executed_instead_is_remembered(policy):
@@ -316,48 +375,13 @@ def test_what_was_executed_instead_is_remembered(policy):
         torch.testing.assert_close(policy.shield.latent["h"], predicted["h"])
 
 
-@pytest.mark.parametrize(("law", "lookahead"), [("reachability", 3), ("reachability", 0), ("plan", 3)])
-def test_retreat_acts_in_the_critics_place_and_counts_for_v(tiny_continuous_filter, law, lookahead):
-    from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
-    from lerobot_latentsafe.reachability import look_ahead
-
-    policy = LatentSafePolicy.from_pretrained(tiny_continuous_filter).eval()
-    policy.config.law, policy.config.lookahead = law, lookahead
-    policy.config.retreat = {"turn_rate.vel": -0.5}
-    policy.config.epsilon = math.inf
-    decision = policy.shield(along(1)[0], actions([0.3, 1.0]))
-    torch.testing.assert_close(decision.action, torch.tensor([[-0.5, 1.0]] * 3))
-    latent = policy.shield.latent
-    held = policy.normalise_action(torch.tensor([[0.0, 1.0], [-0.5, 1.0]]))
-    critic = policy.critic if law == "reachability" else None
-    with torch.no_grad():
-        value, _ = look_ahead(policy.imagination, latent, held, lookahead, critic)
-        torch.testing.assert_close(policy.value(latent), value)
-
-
-@pytest.mark.parametrize(
-    ("retreat", "wrong"),
-    [
-        ({"down.pos": -0.1}, r"retreat moves down.pos; the actions are turn_rate.vel"),
-        ({"turn_rate.vel": 9.0}, r"retreat .* leaves the range trained on"),
-        ({"turn_rate.vel": math.nan}, r"retreat .* leaves the range trained on"),
-    ],
-)
-def test_retreat_that_cannot_be_is_refused(tiny_continuous_filter, tmp_path, retreat, wrong):
-    from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
-
-    policy = LatentSafePolicy.from_pretrained(tiny_continuous_filter)
-    policy.config.retreat = retreat
-    with pytest.raises(ValueError, match=wrong):
-        LatentSafePolicy(policy.config)
-
-
 @pytest.mark.parametrize(
     ("name", "wrong", "expected"),
     [
         ("release", 1.0, "less than 1"),
         ("release", math.nan, "less than 1"),
         ("dwell", 0, "at least 1 step"),
+        ("patience", 11, "10 overrides"),
         ("fallback_pace", 0.0, "more than 0"),
         ("fallback_pace", math.nan, "more than 0"),
     ],

@@ -295,17 +295,6 @@ def test_once_it_acted_the_robot_is_released_above_another_value(trained):
         assert last(robot).intervened.item() == (last(robot).value.item() <= 0.9)
 
 
-def test_once_it_acted_the_filter_goes_on_for_as_long_as_the_robot_says(trained):
-    with make_robot_from_config(config(trained, epsilon=ALWAYS, dwell=3)) as robot:
-        robot.send_action(PUSH)
-        robot.filter.config.epsilon = NEVER
-        acts = []
-        for _ in range(3):
-            robot.send_action(PUSH)
-            acts.append(last(robot).intervened.item())
-        assert acts == [True, True, False]
-
-
 def test_options_out_of_range_are_refused(trained):
     with pytest.raises(ValueError, match="guard"):
         make_robot_from_config(config(trained, guard=99))

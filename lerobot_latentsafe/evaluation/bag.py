@@ -43,12 +43,11 @@ class FilterSetting:
     epsilon: float
     guard: int
     release: float
-    dwell: int
     fingerprint: str
 
     @classmethod
     def of(cls, path: str, law: str, **changed: float | None) -> "FilterSetting":
-        """Epsilon, guard, release and dwell are the filter's own unless given."""
+        """Epsilon, guard and release are the filter's own unless given."""
         own = read_config(resolve_checkpoint(path))
         chosen = {name: getattr(own, name) if changed.get(name) is None else changed[name] for name in DECIDES}
         return cls(path, law, **chosen, fingerprint=fingerprint(path))
@@ -57,7 +56,7 @@ class FilterSetting:
     def all(cls, paths: list[str], laws: list[str], options: object) -> list["FilterSetting"]:
         """Filters under the first law, and the first of them under the others, which are what it is compared with.
 
-        Epsilon, guard, release and dwell are those of a command line's options.
+        Epsilon, guard and release are those of a command line's options.
         """
         pairs = [(path, laws[0]) for path in paths] + [(paths[0], law) for law in laws[1:]]
         changed = {name: getattr(options, name) for name in DECIDES}
@@ -79,7 +78,6 @@ def add_filter_options(parser: ArgumentParser, n: int) -> None:
     parser.add_argument("--epsilon", type=float)
     parser.add_argument("--guard", type=int)
     parser.add_argument("--release", type=float)
-    parser.add_argument("--dwell", type=int)
     parser.add_argument("--workers", type=int, default=1, help="processes")
 
 

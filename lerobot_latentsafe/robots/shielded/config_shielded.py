@@ -35,7 +35,7 @@ class LatentSafeShieldedConfig(RobotConfig):
         inner: the robot that moves.
         filter: a trained filter: a folder, a Hub id or the name of a committed one.
         mode: `filter` or `monitor`, which only reports; None takes the filter's.
-        epsilon, guard, release, dwell: of the filter law; None takes the filter's.
+        epsilon, guard, release: of the filter law; None takes the filter's.
         device: where the filter runs; None takes the filter's.
         fps: rate of the loop that drives it, if known beforehand: it must be the filter's.
         unfiltered_moves: let pass what moves the robot between episodes (LeRobot's return of an arm to its start, a
@@ -50,7 +50,6 @@ class LatentSafeShieldedConfig(RobotConfig):
     epsilon: float | None = None
     guard: int | None = None
     release: float | None = None
-    dwell: int | None = None
     device: str | None = None
     fps: int | None = None
     unfiltered_moves: bool = False
