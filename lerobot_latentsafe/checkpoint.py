@@ -85,7 +85,7 @@ def _digest(file: Path) -> str:
 TRAINED = (
     "stage", "target", "task", "world_model", "cameras", "fps", "state_names", "action_names", "action_low",
     "action_high", "action_varies", "state_mean", "state_std", "action_candidates", "kept_commands", "fallback_moves",
-    "fallback_low", "fallback_high", "fallback_pace",
+    "fallback_low", "fallback_high",
 )  # fmt: skip
 """Entries of config.json that belong to the weights; epsilon, mode, device and the like are the user's."""
 

@@ -74,7 +74,6 @@ class LatentSafeConfig(PreTrainedConfig):
             what it does, and the fallback would exploit that.
         fallback_low, fallback_high: the range of the fallback's continuous actions, in [-1, 1]: that which the data
             cover. Set by `latentsafe train-reachability`.
-        fallback_pace: share of that range which the fallback uses: at full speed it may shake out what it holds.
         action_varies: False for commands the data never vary; the filter keeps those and knows nothing else of them.
     """
 
@@ -93,7 +92,6 @@ class LatentSafeConfig(PreTrainedConfig):
     fallback_moves: list[str] | None = None
     fallback_low: list[float] | None = None
     fallback_high: list[float] | None = None
-    fallback_pace: float = 1.0
     stage: str = "untrained"
     target: str = "reachability"
 
@@ -156,8 +154,6 @@ class LatentSafeConfig(PreTrainedConfig):
             raise ValueError(f"--policy.patience is {self.patience}; expected 0 (retreat at once) to 10 overrides")
         if self.dwell < 1:
             raise ValueError(f"--policy.dwell is {self.dwell}; expected at least 1 step")
-        if not 0 < self.fallback_pace <= 1:
-            raise ValueError(f"--policy.fallback_pace is {self.fallback_pace}; expected more than 0, at most 1 (all)")
         if not self.release < 1:
             raise ValueError(f"--policy.release is {self.release}; expected less than 1, which V never exceeds")
         if self.samples < 0:

@@ -94,7 +94,7 @@ class LatentSafePolicy(PreTrainedPolicy):
         for sign, bound in (("-", self.config.fallback_low), ("+", self.config.fallback_high)):
             allowed = [chosen is None or name in chosen or sign + name in chosen for name in names]
             bound = torch.tensor(bound) if bound else float(sign + "1") * torch.ones(len(names))
-            bounds.append(self.config.fallback_pace * (bound * torch.tensor(allowed)).to(moves.device) * moves)
+            bounds.append((bound * torch.tensor(allowed)).to(moves.device) * moves)
         sizes = self.world_model.feature_dim, len(moves), candidates, self.config.reachability
         return SafetyCritic(*sizes, *bounds, self.config.target).to(moves.device)
 

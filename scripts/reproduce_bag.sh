@@ -38,15 +38,18 @@ filter() { # seed
   [ -e "$OUT/final_$1" ] || $BIN/latentsafe wrap --policy.path="$OUT/filter_$1" --output_dir="$OUT/final_$1" --half=true
 }
 
-# Each at a seed of its own: at one seed all sources start from the same bags.
-record bag_mix bag_mix 0 100
-record bag_dither bag_dither 21 60
-record bag_lifts bag_lifts 22 60
-record bag_policies bag_policies 23 50
-record bag_pulls bag_pulls 25 100
-record bag_shielded bag_shielded 29 75
-record bag_retreats bag_retreats 31 100
-record bag_middle bag_middle 32 50
+record bag_mix bag_mix 0 400
+record bag_branches bag_branches 0 150
+record bag_climbs bag_climbs 0
+record bag_lifts bag_lifts 0 100
+record bag_middle bag_middle 0
+record bag_between bag_between 0
+record bag_dither bag_dither 0
+record bag_dither_more bag_dither 21 # a seed of its own: bags of all sources lie alike at the same seed
+record bag_clumsy bag_clumsy 0
+record bag_policies bag_policies 23 175
+record bag_lifts_more bag_lifts 22
+record bag_pulls bag_pulls 25
 record bag_strong bag_strong 0
 record bag_weak bag_weak 0
 record held_branches bag_branches 1 50
@@ -58,7 +61,7 @@ import sys
 from pathlib import Path
 from lerobot.datasets.aggregate import aggregate_datasets
 data = Path(sys.argv[1])
-names = "mix dither lifts policies pulls shielded retreats middle"
+names = "mix branches climbs lifts middle between dither clumsy dither_more policies lifts_more pulls"
 parts = [f"bag_{name}" for name in names.split()]
 aggregate_datasets([f"latentsafe/{p}" for p in parts], "latentsafe/bag", [data / p for p in parts], data / "bag.begun")
 (data / "bag.begun").rename(data / "bag")

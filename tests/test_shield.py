@@ -382,8 +382,6 @@ def test_what_was_executed_instead_is_remembered(policy):
         ("release", math.nan, "less than 1"),
         ("dwell", 0, "at least 1 step"),
         ("patience", 11, "10 overrides"),
-        ("fallback_pace", 0.0, "more than 0"),
-        ("fallback_pace", math.nan, "more than 0"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(policy, name, wrong, expected):
