@@ -91,7 +91,12 @@ def add_laws(parser: ArgumentParser) -> None:
 
 def in_use(settings: list[FilterSetting]) -> dict[str, dict]:
     """Path -> what a table notes of a filter beside its rates."""
-    return {setting.path: {name: getattr(setting, name) for name in DECIDES} for setting in settings}
+    rows = {setting.path: {name: getattr(setting, name) for name in DECIDES} for setting in settings}
+    for path, row in rows.items():
+        own = read_config(resolve_checkpoint(path))
+        if own.retreat:
+            row |= {"retreat": own.retreat, "patience": own.patience, "dwell": own.dwell}
+    return rows
 
 
 def as_job(setting: FilterSetting | None) -> dict | None:
