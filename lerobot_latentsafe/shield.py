@@ -91,7 +91,8 @@ class Shield:
         sizes = [len(on_the_way), len(state)]
         (value, here), (_, action) = (part.split(sizes) for part in model.plan(both))
         retreats = self._retreats(len(state))
-        fallback = torch.where(retreats[:, None], self._retreat(state), self._usable(action, here, state))
+        moves = retreats & torch.isfinite(here)  # where nothing is known, nothing moves
+        fallback = torch.where(moves[:, None], self._retreat(state), self._usable(action, here, state))
         # A margin that is negative now, or on the way, is a failure whatever comes after.
         value = model.worst(on_the_way, value).view(-1, len(state)).amin(0)
         value = model.worst(margin, value)

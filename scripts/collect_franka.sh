@@ -15,7 +15,7 @@ done
 [ -e "$OUT/bag_pulls" ] || .venv/bin/latentsafe collect --source=bag_pulls --repo_id=latentsafe/bag_pulls \
   --root="$OUT/bag_pulls" --seed=25
 [ -e "$OUT/bag_retreats" ] || .venv/bin/latentsafe collect --source=bag_retreats --repo_id=latentsafe/bag_retreats \
-  --root="$OUT/bag_retreats" --seed=31
+  --root="$OUT/bag_retreats" --seed=31 --n_episodes=100
 # Interrupted where the committed filter would act.
 [ -e "$OUT/bag_shielded" ] || .venv/bin/latentsafe collect --source=bag_shielded --repo_id=latentsafe/bag_shielded \
-  --root="$OUT/bag_shielded" --seed=29 --n_episodes=100
+  --root="$OUT/bag_shielded" --seed=29 --n_episodes=75

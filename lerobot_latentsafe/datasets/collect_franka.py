@@ -77,6 +77,7 @@ class Source:
 
 
 POLICIES = {"bag_diffusion_weak": 150, "bag_diffusion_strong": 50}
+"""Of the bag, as committed; the weak one spills, of which there is more to learn."""
 
 SOURCES: dict[str, Source] = {
     "bag_mix": Source("bag", {"random": 1000, "open_end": 75, "middle": 75, "closed_end": 100, "side_to_side": 50}),
