@@ -14,6 +14,8 @@ MODES = ("filter", "monitor")
 LAWS = ("reachability", "risk", "plan", "margin")
 DECIDES = ("epsilon", "guard", "release")
 """Settings that say, with a law, when a filter acts."""
+RECENT = 10
+"""Steps whose overrides count for `patience`."""
 
 
 class CriticTargetError(ValueError):
@@ -150,8 +152,10 @@ class LatentSafeConfig(PreTrainedConfig):
             raise ValueError(f"--policy.lookahead is {self.lookahead}; expected 0 (critic alone) to 25 imagined steps")
         if not 1 <= self.guard <= 25:
             raise ValueError(f"--policy.guard is {self.guard}; expected 1 (the paper's law) to 25 steps")
-        if not 0 <= self.patience <= 10:
-            raise ValueError(f"--policy.patience is {self.patience}; expected 0 (retreat at once) to 10 overrides")
+        if not 0 <= self.patience <= RECENT:
+            raise ValueError(
+                f"--policy.patience is {self.patience}; expected 0 (retreat at once) to {RECENT} overrides"
+            )
         if self.dwell < 1:
             raise ValueError(f"--policy.dwell is {self.dwell}; expected at least 1 step")
         if not self.release < 1:
@@ -163,6 +167,22 @@ class LatentSafeConfig(PreTrainedConfig):
         if self.margin_delta <= 0:
             raise ValueError(f"--policy.margin_delta is {self.margin_delta}; expected a positive number")
         self.require_critic_of_law()
+        self.require_possible_retreat()
+
+    def require_possible_retreat(self) -> None:
+        """Refuse a retreat by commands that are unknown or kept, or out of the range trained on, once that is known."""
+        if self.action_low is None:
+            return
+        ranges = dict(zip(self.action_names or [], zip(self.action_low, self.action_high)))
+        for name, motion in self.retreat.items():
+            if name not in ranges:
+                raise ValueError(f"--policy.retreat moves {name}; the actions are {', '.join(ranges)}")
+            if name in self.kept_commands:
+                raise ValueError(f"--policy.retreat moves {name}, one of kept_commands, which no fallback changes")
+            low, high = ranges[name]
+            if not low <= motion <= high:
+                wrong = f"--policy.retreat {name} is {motion:g}"
+                raise ValueError(f"{wrong}; the filter was trained on {low:g} to {high:g}")
 
     def require_critic_of_law(self) -> None:
         """Refuse a law that reads the critic as something it was not trained for.

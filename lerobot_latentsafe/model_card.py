@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from huggingface_hub import ModelCard, ModelCardData
 
-from lerobot_latentsafe.configuration_latentsafe import LAWS, LatentSafeConfig
+from lerobot_latentsafe.configuration_latentsafe import LAWS, RECENT, LatentSafeConfig
 from lerobot_latentsafe.evaluation.report import share
 
 if TYPE_CHECKING:
@@ -154,7 +154,7 @@ def fallback(config: LatentSafeConfig) -> str:
     if not config.retreat:
         return "the critic's action"
     moves = ", ".join(f"{name} {motion:+g} a step" for name, motion in config.retreat.items())
-    after = f"the critic's action; after {config.patience} overrides within ten steps " if config.patience else ""
+    after = f"the critic's action; after {config.patience} overrides within {RECENT} steps " if config.patience else ""
     return f"{after}the retreat ({moves}) for at least {config.dwell} steps"
 
 

@@ -66,6 +66,7 @@ class LatentSafePolicy(PreTrainedPolicy):
         unknown = [name for name in named if name not in config.action_names]
         if unknown:
             raise ValueError(f"no action is named {', '.join(unknown)}; there are {', '.join(config.action_names)}")
+        config.require_possible_retreat()  # a dataset may have told the ranges only now
         n_actions = len(config.action_low)
         self.world_model = config.world_model.build(config.cameras, len(config.state_mean), n_actions)
         if self.reader is not None and self.reader.cache is not None:
@@ -80,7 +81,6 @@ class LatentSafePolicy(PreTrainedPolicy):
         kept = torch.tensor([name in config.kept_commands for name in config.action_names])
         self.register_buffer("kept", kept, persistent=False)
         self.critic = self.new_critic(candidates)
-        _check_retreat(config)
         self._ddp_params_and_buffers_to_ignore = self._never_averaged()
         self._base: list[BasePolicy] = []  # in a list, so that its weights are not ours
         self.shield = Shield(self)
@@ -363,17 +363,6 @@ def adopt_dataset(config: LatentSafeConfig, meta, stats: dict) -> None:
                 f"action candidate {candidate} is outside of what {meta.repo_id} covers: "
                 f"{config.action_low} to {config.action_high}"
             )
-
-
-def _check_retreat(config: LatentSafeConfig) -> None:
-    """Refuse a retreat by unknown commands, or out of the range trained on."""
-    ranges = dict(zip(config.action_names or [], zip(config.action_low, config.action_high)))
-    for name, motion in config.retreat.items():
-        if name not in ranges:
-            raise ValueError(f"--policy.retreat moves {name}; the actions are {', '.join(ranges)}")
-        low, high = ranges[name]
-        if not low <= motion <= high:
-            raise ValueError(f"--policy.retreat {name} is {motion:g}; the filter was trained on {low:g} to {high:g}")
 
 
 def _check_range(config: LatentSafeConfig, repo_id: str, low: list[float], high: list[float]) -> None:

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from lerobot_latentsafe.checkpoint import TRAINED
 from lerobot_latentsafe.chunks import ChunksAhead, queued_actions
+from lerobot_latentsafe.configuration_latentsafe import RECENT
 from lerobot_latentsafe.datasets.frame_cache import check_proportions
 from lerobot_latentsafe.filter import FilterDecision, Reason, least_restrictive
 from lerobot_latentsafe.memory import keep_freed_memory
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-RECENT = 10
-"""Steps whose overrides count for `patience`."""
 RANGE_TOLERANCE = 1e-3
 """Share of the action range by which float error may exceed it."""
 
@@ -90,7 +89,9 @@ class Shield:
         both = {key: torch.cat([predicted[key], latent[key]]) for key in latent}  # one pass through imagination
         sizes = [len(on_the_way), len(state)]
         (value, here), (_, action) = (part.split(sizes) for part in model.plan(both))
-        retreats = self._retreats(len(state))
+        if self.recent is None:
+            self._forget_overrides(len(state))
+        retreats = self._retreats()
         moves = retreats & torch.isfinite(here)  # where nothing is known, nothing moves
         fallback = torch.where(moves[:, None], self._retreat(state), self._usable(action, here, state))
         # A margin that is negative now, or on the way, is a failure whatever comes after.
@@ -114,12 +115,14 @@ class Shield:
         """Remember (B, A) in robot units as what was done; call it where something else was than was decided."""
         self.executed = self.filter.normalise_action(action).nan_to_num(0.0).clamp(-1, 1)
 
-    def _retreats(self, n: int) -> Tensor:
+    def _forget_overrides(self, n: int) -> None:
+        """For n robots: of the last steps, whether they were overridden; and the steps of a retreat that goes on."""
+        self.recent = torch.zeros(n, RECENT, dtype=torch.bool, device=self.filter.device)
+        self.retreated = torch.zeros(n, dtype=torch.long, device=self.filter.device)
+
+    def _retreats(self) -> Tensor:
         """Whether an override now would be the retreat's: one goes on, or the critic's action has been tried: (B,)."""
-        model, config = self.filter, self.filter.config
-        if self.recent is None:
-            self.recent = torch.zeros(n, RECENT, dtype=torch.bool, device=model.device)
-            self.retreated = torch.zeros(n, dtype=torch.long, device=model.device)
+        config = self.filter.config
         tried = self.recent.sum(1) >= config.patience
         return (self.retreated > 0) | tried if config.retreat else torch.zeros_like(tried)
 
@@ -130,7 +133,7 @@ class Shield:
             action[:, model.config.action_names.index(name)] = motion
         return action
 
-    def _threshold(self) -> float | Tensor:
+    def _threshold(self) -> Tensor:
         """What V must exceed: epsilon; where the filter acts `release`, and before `dwell` steps of retreat nothing."""
         config, acting = self.filter.config, self.recent[:, -1]
         threshold = torch.where(acting, max(config.epsilon, config.release), config.epsilon)

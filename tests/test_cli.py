@@ -187,6 +187,12 @@ def test_wrap_can_leave_out_what_draws(capsys, tiny_filter, tmp_path):
     assert "the gru world model draws nothing" in fails(capsys, "wrap", *options)
 
 
+def test_wrap_refuses_a_retreat_that_cannot_be_before_it_writes(capsys, tiny_filter, tmp_path):
+    options = [f"--policy.path={tiny_filter}", "--retreat={down.pos: -0.1}", f"--output_dir={tmp_path / 'w'}"]
+    assert "retreat moves down.pos; the actions are turn_rate.vel" in fails(capsys, "wrap", *options)
+    assert not (tmp_path / "w").exists()
+
+
 def test_wrap_refuses_an_unknown_mode(capsys, tiny_filter, tmp_path):
     message = fails(capsys, "wrap", f"--policy.path={tiny_filter}", "--mode=watch", f"--output_dir={tmp_path / 'w'}")
     assert "expected one of filter, monitor" in message and not (tmp_path / "w").exists()

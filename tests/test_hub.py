@@ -150,7 +150,7 @@ def test_card_says_what_acts_in_place_of_an_unsafe_action(policy):
     policy.config.retreat, policy.config.dwell = {"turn_rate.vel": -0.5}, 15
     assert said() == "the retreat (turn_rate.vel -0.5 a step) for at least 15 steps"
     policy.config.patience = 2
-    assert said().startswith("the critic's action; after 2 overrides within ten steps the retreat (turn_rate.vel")
+    assert said().startswith("the critic's action; after 2 overrides within 10 steps the retreat (turn_rate.vel")
 
 
 def test_unknown_id_is_a_clear_error(hub):

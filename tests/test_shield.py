@@ -287,7 +287,7 @@ def test_once_the_filter_acts_the_policy_is_released_above_another_value(permiss
     value = shield(along(1)[0], actions(LEFT)).value
     for acting, release in ((False, 1.0), (True, value.min().item() - 1e-3), (True, value.max().item() + 1e-3)):
         shield.reset()
-        shield._retreats(3)
+        shield._forget_overrides(3)
         config.release, shield.recent[:, -1] = release, acting
         assert (shield(along(1)[0], actions(LEFT)).intervened == (release > value) & acting).all()
         assert shield.recent[:, -2].all() == acting
@@ -360,9 +360,16 @@ def test_retreat_that_cannot_be_is_refused(tiny_continuous_filter, retreat, wron
     from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 
     policy = LatentSafePolicy.from_pretrained(tiny_continuous_filter)
+    with pytest.raises(ValueError, match=wrong):
+        replace(policy.config, retreat=retreat)
     policy.config.retreat = retreat
     with pytest.raises(ValueError, match=wrong):
         LatentSafePolicy(policy.config)
+
+
+def test_retreat_leaves_kept_commands_alone(policy):
+    with pytest.raises(ValueError, match=r"moves turn_rate.vel, one of kept_commands"):
+        replace(policy.config, kept_commands=["turn_rate.vel"], retreat=RETREAT)
 
 
 def test_what_was_executed_instead_is_remembered(policy):

@@ -14,7 +14,7 @@ from lerobot_latentsafe.evaluation.rollouts import provenance, wilson
 from lerobot_latentsafe.evaluation.shielding import Episodes, check_environment, compare, count_reasons
 from lerobot_latentsafe.filter import Reason
 from lerobot_latentsafe.labeling.frames import DatasetFrames
-from lerobot_latentsafe.model_card import threshold
+from lerobot_latentsafe.model_card import fallback, threshold
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.world_models.base import Latent
 
@@ -100,6 +100,7 @@ def _about(policy: LatentSafePolicy) -> list[str]:
         ["rate", f"{config.fps} steps a second"],
         ["failure means", f"the recordings' label {config.failure_specification!r}"],
         ["threshold", f"epsilon = {threshold(config)}, {evidence}"],
+        ["fallback", fallback(config)],
         ["mode", "overrides unsafe actions" if config.mode == "filter" else "only watches"],
     ]
     return [report.heading("The filter"), report.table(["", ""], rows)]
