@@ -289,6 +289,8 @@ class Wrap:
     """Command -> robot units a step, as {delta_z.pos: -0.006}: what acts where the critic's action did not help."""
     patience: int | None = None
     dwell: int | None = None
+    memory: int | None = None
+    """Frames that are remembered at most, such as a clip of the world model's training has."""
     law: str | None = None
     mode: str | None = None
     half: bool = False
@@ -303,7 +305,7 @@ class Wrap:
 
         refuse_existing(self.output_dir)
         policy = LatentSafePolicy.from_pretrained(self.policy.path)
-        policy.config.override(self, *DECIDES, "retreat", "patience", "dwell", "law", "mode")
+        policy.config.override(self, *DECIDES, "retreat", "patience", "dwell", "memory", "law", "mode")
         if not self.drawing:
             if not policy.world_model.draws:
                 raise ValueError(f"--drawing=false, but the {policy.config.world_model.type} world model draws nothing")

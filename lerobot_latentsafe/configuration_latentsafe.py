@@ -50,6 +50,8 @@ class LatentSafeConfig(PreTrainedConfig):
             same for waiting at a doubtful place as for leaving it, and the critic may wait.
         patience: overrides in the last ten steps after which the next is the retreat's.
         dwell: steps for which a retreat goes on at least: a single step leads nowhere.
+        memory: frames that the filter remembers at most, and at least half as many; 0: the whole episode. A recurrent
+            world model may make anything of more frames than a clip of its training has.
         guard: steps for which the proposed action is imagined held before V is asked. 1 is the paper's law; more give
             room for what the world model gets wrong, as time, which a saturated margin cannot.
         calibration: the evidence epsilon was chosen on; written by `latentsafe calibrate`.
@@ -102,6 +104,7 @@ class LatentSafeConfig(PreTrainedConfig):
     retreat: dict[str, float] = field(default_factory=dict)
     patience: int = 0
     dwell: int = 1
+    memory: int = 0
     guard: int = 1
     samples: int = 0
     calibration: dict[str, float] = field(default_factory=dict)
@@ -158,6 +161,8 @@ class LatentSafeConfig(PreTrainedConfig):
             )
         if self.dwell < 1:
             raise ValueError(f"--policy.dwell is {self.dwell}; expected at least 1 step")
+        if self.memory != 0 and self.memory < 2:
+            raise ValueError(f"--policy.memory is {self.memory}; expected 0 (the whole episode) or at least 2 frames")
         if not self.release < 1:
             raise ValueError(f"--policy.release is {self.release}; expected less than 1, which V never exceeds")
         if self.samples < 0:

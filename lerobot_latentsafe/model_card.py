@@ -163,7 +163,7 @@ def _world_model(config: LatentSafeConfig) -> str:
     if perception := getattr(config.world_model, "perception", None):
         text += f", on {perception.components} components of the frozen encoder `{perception.encoder}`"
         text += f" (weights {perception.encoder_hash}), which is not part of the checkpoint"
-    return text
+    return text + (f"; remembers {config.memory} frames at most" if config.memory else "")
 
 
 def _imagination(samples: int) -> str:

@@ -50,6 +50,8 @@ class Shield:
     def reset(self) -> None:
         """Forget the history: call at the start of every episode."""
         self.latent: Latent | None = None
+        self.younger: Latent | None = None
+        self.n_seen = 0
         self.executed: Tensor | None = None
         self.decision: FilterDecision | None = None
         self.decided_at: float | None = None
@@ -83,7 +85,7 @@ class Shield:
         images, state, fault = self._check_observation(observation, age_s)
         fault, proposed, inputs = self._check_action(proposed, fault, state, without)
         fault = _first_fault(fault, torch.ones_like(fault, dtype=torch.bool), known)
-        latent = self._filter_history(images, state, inputs, fault)
+        latent, younger = self._filter_history(images, state, inputs, fault)
         margin = model.imagination.margin(latent)
         predicted, on_the_way = self._go_on(latent, inputs)
         both = {key: torch.cat([predicted[key], latent[key]]) for key in latent}  # one pass through imagination
@@ -106,7 +108,8 @@ class Shield:
         acts = decision.intervened
         self.recent = torch.cat([self.recent[:, 1:], acts[:, None]], 1)
         self.retreated = (self.retreated + 1) * (acts & retreats)
-        self.latent, self.decision, self.decided_at = latent, decision, finished
+        self.latent, self.younger, self.n_seen = latent, younger, self.n_seen + 1
+        self.decision, self.decided_at = decision, finished
         self.was_executed(decision.action)
         self._tell(decision)
         return decision
@@ -161,7 +164,8 @@ class Shield:
         for other in _shields - {self}:
             fresh = other.decided_at is not None and 0 <= self.clock() - other.decided_at <= within_s
             if fresh and torch.equal(other.decision.action.cpu(), action) and self._no_stricter_than(other):
-                self.latent, self.executed = other.latent, other.executed
+                self.latent, self.younger, self.n_seen = other.latent, other.younger, other.n_seen
+                self.executed = other.executed
                 self.decision, self.decided_at = other.decision, other.decided_at
                 self.recent, self.retreated = other.recent, other.retreated
                 return True
@@ -170,7 +174,7 @@ class Shield:
     def _no_stricter_than(self, other: "Shield") -> bool:
         """Whether the other has our weights, acts, and passes nothing that we would not."""
         own, theirs = self.filter.config, other.filter.config
-        alike = (*TRAINED, "law", "lookahead", "guard", "samples", "retreat", "patience")
+        alike = (*TRAINED, "law", "lookahead", "guard", "samples", "memory", "retreat", "patience")
         same = all(getattr(own, name) == getattr(theirs, name) for name in alike)
         laxer = any(getattr(theirs, name) < getattr(own, name) for name in ("epsilon", "release", "dwell"))
         if not same or theirs.mode == "monitor" or laxer:
@@ -241,15 +245,31 @@ class Shield:
         fault = _first_fault(fault, out_of_range, Reason.ACTION_OUT_OF_RANGE)
         return fault, proposed, inputs.clamp(-1, 1)
 
-    def _filter_history(self, images: dict[str, Tensor], state: Tensor, inputs: Tensor, fault: Tensor) -> Latent:
-        """Posterior of the world model; rows whose observation is unusable go on by imagination alone."""
+    def _filter_history(
+        self, images: dict[str, Tensor], state: Tensor, inputs: Tensor, fault: Tensor
+    ) -> tuple[Latent, Latent | None]:
+        """Posteriors of the world model; rows whose observation is unusable go on by imagination alone.
+
+        Returns:
+            The one that decides; and, where the filter forgets, a younger one that will take its place.
+        """
         world_model = self.filter.world_model
-        start = self.latent is None
-        latent = world_model.initial(len(state)) if start else self.latent
-        predicted = world_model.step(latent, self.filter.first_action(inputs) if start else self.executed)
-        seen = world_model.correct(predicted, world_model.perceive(images), state)
+        percepts = world_model.perceive(images)
         blind = (fault >= Reason.OBSERVATION_NOT_FINITE) & (fault <= Reason.OBSERVATION_STALE)
-        return replace_rows(seen, predicted, where=blind)
+        before = inputs if self.executed is None else self.executed
+
+        def go_on(latent: Latent | None) -> Latent:
+            start = latent is None
+            latent = world_model.initial(len(state)) if start else latent
+            predicted = world_model.step(latent, self.filter.first_action(before) if start else before)
+            return replace_rows(world_model.correct(predicted, percepts, state), predicted, where=blind)
+
+        half = self.filter.config.memory // 2
+        if not half:
+            return go_on(self.latent), None
+        if self.n_seen % half == 0:
+            return go_on(self.younger), go_on(None)
+        return go_on(self.latent), go_on(self.younger)
 
     def _go_on(self, latent: Latent, action: Tensor) -> tuple[Latent, Tensor]:
         """N x B latents after `guard` steps of the action (B, A), and the least margin until there (N x B,).

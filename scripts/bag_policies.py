@@ -5,7 +5,7 @@
 
 Writes results/bag/policies.json: for each policy bare, under each filter, and under the laws that the first filter is
 compared with, runs that spill, candies lost, success, steps overridden, step of the first override, CPU time of a
-decision; and severity.png beside it, how many runs spill at least p% of the candies. Each run is kept in a .jsonl
+decision; and a picture beside it (.png), how many runs spill at least p% of the candies. Each run is kept in a .jsonl
 beside the output: a killed experiment goes on.
 """
 
@@ -107,7 +107,7 @@ def main() -> None:
         print(f"{who}, bare: {in_short(laws['bare'])}")
         for setting in settings:
             print(f"{who}, {setting.law} of {setting.path}: {in_short(laws[setting.law][setting.path])}")
-    draw(table, arguments.laws[0], arguments.output.with_name("severity.png"))
+    draw(table, arguments.laws[0], arguments.output.with_suffix(".png"))
     write_json(arguments.output, {**table, "filters": in_use(settings), **made_by})
     for who in bases:
         for seed in range(FIRST_SEED, FIRST_SEED + arguments.n_videos):

@@ -95,7 +95,7 @@ def report(out: Path, law: str, seconds: float) -> None:
             ),
             *(
                 html.picture(path, "How many runs of the policy spill at least p% of the candies.")
-                for path in out.glob("severity.png")
+                for path in out.glob("policies.png")
             ),
             html.heading("What the filter sees coming"),
             *(

@@ -94,7 +94,7 @@ def test_policies_are_compared_operators_traced_and_the_demo_tells(script, filte
     page, numbers = (tmp_path / "report.html").read_text(), json.loads((tmp_path / "metrics.json").read_text())
     assert page.count("<video") == 1 and page.count("<img") == 3 + PRINTED and "0/2 = 0.0%" in page
     assert numbers["the same, shielded"]["overridden_share"] == 1.0 and "1.5 minutes" in capsys.readouterr().out
-    for file in (policies, tmp_path / "severity.png", *tmp_path.glob("videos/*.mp4")):  # without a policy
+    for file in (policies, policies.with_suffix(".png"), *tmp_path.glob("videos/*.mp4")):  # without a policy
         file.unlink()
     script("demo_bag").report(tmp_path, "margin", 90.0)
     assert (tmp_path / "report.html").read_text().count("<img") == 2

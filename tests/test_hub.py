@@ -141,6 +141,12 @@ def test_card_says_above_what_the_base_policy_is_released(policy):
     assert "| epsilon | 0.4; once the filter acts, 0.5 |" in card.text
 
 
+def test_card_says_how_much_the_filter_remembers(policy):
+    policy.config.memory = 24
+    card = policy.generate_model_card("me/car", "latentsafe", None, None)
+    assert "px; remembers 24 frames at most |" in card.text
+
+
 def test_card_says_what_acts_in_place_of_an_unsafe_action(policy):
     def said():
         card = policy.generate_model_card("me/car", "latentsafe", None, None)

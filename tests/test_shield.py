@@ -68,6 +68,16 @@ def test_history_is_the_world_models_encoding_of_the_clip(permissive):
     assert_same(permissive.shield.latent, encode(permissive, observations, taken))
 
 
+@pytest.mark.parametrize(("memory", "remembered"), [(0, 7), (4, 3), (5, 3), (6, 4), (12, 7)])
+def test_memory_is_of_the_last_frames_only(permissive, memory, remembered):
+    permissive.config.memory = memory
+    observations, taken = along(7), [actions(LEFT), actions(STRAIGHT), actions(LEFT, RIGHT, STRAIGHT)] * 2
+    for observation, action in zip(observations, [*taken, actions(STRAIGHT)]):
+        permissive.shield(observation, action)
+    last = taken[len(taken) - remembered + 1 :]
+    assert_same(permissive.shield.latent, encode(permissive, observations[-remembered:], last))
+
+
 def test_executed_actions_enter_the_history_not_proposed_ones(strict):
     observations, taken = along(3), []
     for observation in observations:
@@ -389,6 +399,8 @@ def test_what_was_executed_instead_is_remembered(policy):
         ("release", math.nan, "less than 1"),
         ("dwell", 0, "at least 1 step"),
         ("patience", 11, "10 overrides"),
+        ("memory", 1, "at least 2 frames"),
+        ("memory", -4, "at least 2 frames"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(policy, name, wrong, expected):

@@ -94,6 +94,7 @@ def in_use(settings: list[FilterSetting]) -> dict[str, dict]:
     rows = {setting.path: {name: getattr(setting, name) for name in DECIDES} for setting in settings}
     for path, row in rows.items():
         own = read_config(resolve_checkpoint(path))
+        row |= {"memory": own.memory} if own.memory else {}
         if own.retreat:
             row |= {"retreat": own.retreat, "patience": own.patience, "dwell": own.dwell}
     return rows
