@@ -147,9 +147,10 @@ class EvalWorldModel:
     """Ask a trained world model whether it obeys the action, looks, and knows failure in imagination.
 
     On held-out episodes, cached by `latentsafe cache`: prediction errors against shuffled actions and against copying
-    the last frame; the margin on seen and imagined frames; and whether the model, shown the first frame of an episode,
-    foresees how it ends. On episodes that branch from one state (bag_branches) that takes obeying the action; on
-    episodes that share one motion (bag_lifts) it takes looking. Read it beside a control that is blind.
+    the last frame; the margin on seen and imagined frames; whether the model, shown the first frame of an episode,
+    foresees how it ends; and whether it foresees the next second from all along the way, with the filter's `memory`.
+    On episodes that branch from one state (bag_branches) that takes obeying the action; on episodes that share one
+    motion (bag_lifts) it takes looking. Read it beside a control that is blind.
     """
 
     policy: PolicySource

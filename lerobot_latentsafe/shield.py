@@ -21,7 +21,7 @@ from lerobot_latentsafe.configuration_latentsafe import RECENT
 from lerobot_latentsafe.datasets.frame_cache import check_proportions
 from lerobot_latentsafe.filter import FilterDecision, Reason, least_restrictive
 from lerobot_latentsafe.memory import keep_freed_memory
-from lerobot_latentsafe.world_models.base import Latent, map_latent, replace_rows
+from lerobot_latentsafe.world_models.base import Belief, Latent, map_latent, replace_rows
 
 if TYPE_CHECKING:
     from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
@@ -49,9 +49,7 @@ class Shield:
 
     def reset(self) -> None:
         """Forget the history: call at the start of every episode."""
-        self.latent: Latent | None = None
-        self.younger: Latent | None = None
-        self.n_seen = 0
+        self.belief = Belief()
         self.executed: Tensor | None = None
         self.decision: FilterDecision | None = None
         self.decided_at: float | None = None
@@ -85,7 +83,8 @@ class Shield:
         images, state, fault = self._check_observation(observation, age_s)
         fault, proposed, inputs = self._check_action(proposed, fault, state, without)
         fault = _first_fault(fault, torch.ones_like(fault, dtype=torch.bool), known)
-        latent, younger = self._filter_history(images, state, inputs, fault)
+        belief = self._filter_history(images, state, inputs, fault)
+        latent = belief.latent
         margin = model.imagination.margin(latent)
         predicted, on_the_way = self._go_on(latent, inputs)
         both = {key: torch.cat([predicted[key], latent[key]]) for key in latent}  # one pass through imagination
@@ -108,11 +107,15 @@ class Shield:
         acts = decision.intervened
         self.recent = torch.cat([self.recent[:, 1:], acts[:, None]], 1)
         self.retreated = (self.retreated + 1) * (acts & retreats)
-        self.latent, self.younger, self.n_seen = latent, younger, self.n_seen + 1
-        self.decision, self.decided_at = decision, finished
+        self.belief, self.decision, self.decided_at = belief, decision, finished
         self.was_executed(decision.action)
         self._tell(decision)
         return decision
+
+    @property
+    def latent(self) -> Latent | None:
+        """The posterior that the last decision was made on."""
+        return self.belief.latent
 
     def was_executed(self, action: Tensor) -> None:
         """Remember (B, A) in robot units as what was done; call it where something else was than was decided."""
@@ -164,8 +167,7 @@ class Shield:
         for other in _shields - {self}:
             fresh = other.decided_at is not None and 0 <= self.clock() - other.decided_at <= within_s
             if fresh and torch.equal(other.decision.action.cpu(), action) and self._no_stricter_than(other):
-                self.latent, self.younger, self.n_seen = other.latent, other.younger, other.n_seen
-                self.executed = other.executed
+                self.belief, self.executed = other.belief, other.executed
                 self.decision, self.decided_at = other.decision, other.decided_at
                 self.recent, self.retreated = other.recent, other.retreated
                 return True
@@ -245,14 +247,8 @@ class Shield:
         fault = _first_fault(fault, out_of_range, Reason.ACTION_OUT_OF_RANGE)
         return fault, proposed, inputs.clamp(-1, 1)
 
-    def _filter_history(
-        self, images: dict[str, Tensor], state: Tensor, inputs: Tensor, fault: Tensor
-    ) -> tuple[Latent, Latent | None]:
-        """Posteriors of the world model; rows whose observation is unusable go on by imagination alone.
-
-        Returns:
-            The one that decides; and, where the filter forgets, a younger one that will take its place.
-        """
+    def _filter_history(self, images: dict[str, Tensor], state: Tensor, inputs: Tensor, fault: Tensor) -> Belief:
+        """What the world model makes of the episode; rows whose observation is unusable go on by imagination alone."""
         world_model = self.filter.world_model
         percepts = world_model.perceive(images)
         blind = (fault >= Reason.OBSERVATION_NOT_FINITE) & (fault <= Reason.OBSERVATION_STALE)
@@ -264,12 +260,7 @@ class Shield:
             predicted = world_model.step(latent, self.filter.first_action(before) if start else before)
             return replace_rows(world_model.correct(predicted, percepts, state), predicted, where=blind)
 
-        half = self.filter.config.memory // 2
-        if not half:
-            return go_on(self.latent), None
-        if self.n_seen % half == 0:
-            return go_on(self.younger), go_on(None)
-        return go_on(self.latent), go_on(self.younger)
+        return self.belief.after(go_on, self.filter.config.memory)
 
     def _go_on(self, latent: Latent, action: Tensor) -> tuple[Latent, Tensor]:
         """N x B latents after `guard` steps of the action (B, A), and the least margin until there (N x B,).

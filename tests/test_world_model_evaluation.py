@@ -54,6 +54,30 @@ def test_alarmist_has_the_balanced_accuracy_of_chance(policy):
     assert row["hold_false_alarms"]["k"] == row["failing"] + row["safe"]
 
 
+def test_failures_are_foreseen_along_the_way_by_who_sees_them(policy, monkeypatch):
+    labels = policy.reader.labels
+    row = questions.foreseen_along(policy, policy.reader, episodes(policy))
+    assert row["failing"] > 0 and row["safe"] > 0 and row["missed"]["n"] == row["failing"]
+    for says, missed, alarms in ((True, 0, row["safe"]), (False, row["failing"], 0)):
+        monkeypatch.setattr(questions, "_fails", lambda p, latent, action, valid: np.full(len(action), says))  # noqa: B023
+        told = questions.foreseen_along(policy, policy.reader, episodes(policy))
+        assert (told["missed"]["k"], told["false_alarms"]["k"]) == (missed, alarms)
+    safe = [e for e in episodes(policy) if not (labels.failure[labels.episode == e] == 1).any()]
+    assert questions.foreseen_along(policy, policy.reader, np.array(safe))["missed"] is None
+
+
+def test_what_is_foreseen_along_the_way_rests_on_the_filters_memory(policy, monkeypatch):
+    heard = []
+    monkeypatch.setattr(
+        questions, "_fails", lambda p, latent, action, valid: heard.append(latent) or np.zeros(len(action), bool)
+    )
+    for policy.config.memory in (0, 8):
+        questions.foreseen_along(policy, policy.reader, episodes(policy))
+    whole, short = heard[: len(heard) // 2], heard[len(heard) // 2 :]
+    same = [torch.equal(a["hidden"], b["hidden"]) for a, b in zip(whole, short)]
+    assert all(same[:4]) and not any(same[4:])
+
+
 def test_what_fails_after_the_horizon_counts_as_safe(policy):
     ask = lambda steps: evaluate_world_model(policy, policy.reader, episodes(policy), n_windows=8, horizon=steps)  # noqa: E731
     soon, later = ask(1)["episodes"], ask(30)["episodes"]

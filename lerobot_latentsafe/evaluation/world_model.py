@@ -13,11 +13,13 @@ from lerobot_latentsafe.datasets.clips import ClipReader
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE
 from lerobot_latentsafe.evaluation.rollouts import wilson
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
-from lerobot_latentsafe.world_models.base import Clip, Latent
+from lerobot_latentsafe.world_models.base import Belief, Clip, Latent, select
 
 HORIZONS = (1, 5, 10)
 OBSERVED = 4
 """Frames seen before imagination starts."""
+AHEAD = 15
+"""Steps that are imagined from states along an episode."""
 
 
 def evaluate_world_model(
@@ -38,6 +40,7 @@ def evaluate_world_model(
         "errors": prediction_errors(policy, reader, episodes, n_windows, generator),
         "margin": margin_quality(policy, reader, episodes, n_windows, generator),
         "episodes": imagined_episodes(policy, reader, episodes, generator, horizon),
+        "along": foreseen_along(policy, reader, episodes),
     }
 
 
@@ -124,6 +127,45 @@ def imagined_episodes(
     }
 
 
+@torch.no_grad()
+def foreseen_along(policy: LatentSafePolicy, reader: ClipReader, episodes: np.ndarray) -> dict:
+    """From every other state along each episode, known as a filter knows it, imagine the recorded actions.
+
+    What a filter has seen grows with the episode, which what it was trained on did not.
+
+    Returns:
+        failing, safe: states, themselves safe, after which the episode fails within AHEAD steps or does not; missed,
+        false_alarms: of these, or None where there are none.
+    """
+    first = np.array([np.flatnonzero(reader.labels.episode == e)[0] for e in episodes])
+    longest = int(np.unique(reader.labels.episode[reader.labels.episode >= 0], return_counts=True)[1].max())
+    clip, belief, verdicts, outcomes = reader.cut(first, policy, length=longest), Belief(), [], []
+    for t in range(longest - AHEAD):
+        belief = belief.after(lambda latent: _seen(policy, latent, clip, t), policy.config.memory)  # noqa: B023
+        kept = (clip.failure[:, t] == SAFE) & clip.valid[:, t + AHEAD]
+        if t % 2 or not kept.any():
+            continue
+        coming = slice(t + 1, t + 1 + AHEAD)
+        verdicts.append(
+            _fails(policy, select(belief.latent, kept), clip.action[kept, coming], clip.valid[kept, coming])
+        )
+        outcomes.append((clip.failure[kept, coming] == FAILING).any(1).cpu().numpy())
+    verdict, failed = (np.concatenate([*rows, np.zeros(0, bool)]) for rows in (verdicts, outcomes))
+    return {
+        "failing": int(failed.sum()),
+        "safe": int((~failed).sum()),
+        "missed": wilson(int((~verdict[failed]).sum()), int(failed.sum())) if failed.any() else None,
+        "false_alarms": wilson(int(verdict[~failed].sum()), int((~failed).sum())) if not failed.all() else None,
+    }
+
+
+def _seen(policy: LatentSafePolicy, latent: Latent | None, clip: Clip, t: int) -> Latent:
+    """The posterior after frame t of clips."""
+    action = clip.action[:, t] if latent is not None else policy.first_action(clip.action[:, t])
+    percepts = {key: value[:, t] for key, value in clip.percepts.items()}
+    return policy.world_model.observe(latent, action, percepts, clip.state[:, t])
+
+
 def _fails(policy: LatentSafePolicy, latent: Latent, action: Tensor, valid: Tensor) -> np.ndarray:
     """Whether l < 0 at any imagined step."""
     fails = torch.zeros(len(action), dtype=torch.bool, device=action.device)
@@ -158,6 +200,5 @@ def _filtered(policy: LatentSafePolicy, clip: Clip) -> Latent:
     """The latent after the first OBSERVED frames of each window."""
     latent = None
     for t in range(OBSERVED):
-        percepts = {key: value[:, t] for key, value in clip.percepts.items()}
-        latent = policy.world_model.observe(latent, clip.action[:, t], percepts, clip.state[:, t])
+        latent = _seen(policy, latent, clip, t)
     return latent

@@ -90,6 +90,37 @@ class WorldModelConfig(draccus.ChoiceRegistry, abc.ABC):
         """The world model with fresh weights."""
 
 
+@dataclass(frozen=True)
+class Belief:
+    """What is believed of an episode so far.
+
+    Attributes:
+        latent: the posterior.
+        younger: where old frames are forgotten: one that knows the last frames only, and will take its place.
+        n_frames: seen so far.
+    """
+
+    latent: Latent | None = None
+    younger: Latent | None = None
+    n_frames: int = 0
+
+    def after(self, observe: Callable[[Latent | None], Latent], memory: int = 0) -> "Belief":
+        """One frame on.
+
+        Args:
+            observe: posterior, or None at the start -> that after the frame.
+            memory: frames to remember at most, and at least half as many; 0: all.
+        """
+        half = memory // 2
+        if not half:
+            latent, younger = observe(self.latent), None
+        elif self.n_frames % half == 0:
+            latent, younger = observe(self.younger), observe(None)
+        else:
+            latent, younger = observe(self.latent), observe(self.younger)
+        return Belief(latent, younger, self.n_frames + 1)
+
+
 class WorldModel(nn.Module, abc.ABC):
     """z_t ~ encoder(z_t | z_hat_t, o_t), z_hat_{t+1} ~ transition(z_t, a_t) (Section III)."""
 
