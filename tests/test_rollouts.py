@@ -68,3 +68,5 @@ def test_lists_of_numbers_take_one_line(tmp_path):
     write_json(tmp_path / "row.json", content)
     text = (tmp_path / "row.json").read_text()
     assert json.loads(text) == content and '"lost": [1, 2, 3]' in text
+    write_json(tmp_path / "row.json", {"verdicts": float("nan")})
+    assert json.loads((tmp_path / "row.json").read_text()) == {"verdicts": None}

@@ -91,9 +91,10 @@ def _commit() -> str:
 
 
 def write_json(path: str | Path, content: dict) -> None:
-    """Write results, lists of numbers on one line, making folders as needed."""
+    """Write results, lists of numbers on one line and what is not a number as null, making folders as needed."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
+    content = json.loads(json.dumps(content), parse_constant=lambda name: None if name == "NaN" else float(name))
     text = json.dumps(content, indent=2)
     text = re.sub(r'\[\n([^\[\]{}":]*)\]', lambda numbers: f"[{' '.join(numbers[1].split())}]", text)
     path.write_text(text + "\n")
