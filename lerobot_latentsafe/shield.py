@@ -254,13 +254,13 @@ class Shield:
         blind = (fault >= Reason.OBSERVATION_NOT_FINITE) & (fault <= Reason.OBSERVATION_STALE)
         before = inputs if self.executed is None else self.executed
 
-        def go_on(latent: Latent | None) -> Latent:
+        def observe(latent: Latent | None) -> Latent:
             start = latent is None
             latent = world_model.initial(len(state)) if start else latent
             predicted = world_model.step(latent, self.filter.first_action(before) if start else before)
             return replace_rows(world_model.correct(predicted, percepts, state), predicted, where=blind)
 
-        return self.belief.after(go_on, self.filter.config.memory)
+        return self.belief.after(observe, self.filter.config.memory)
 
     def _go_on(self, latent: Latent, action: Tensor) -> tuple[Latent, Tensor]:
         """N x B latents after `guard` steps of the action (B, A), and the least margin until there (N x B,).

@@ -187,6 +187,13 @@ def test_wrap_can_leave_out_what_draws(capsys, tiny_filter, tmp_path):
     assert "the gru world model draws nothing" in fails(capsys, "wrap", *options)
 
 
+def test_wrap_sets_how_much_is_remembered(capsys, tiny_filter, tmp_path):
+    options = [f"--policy.path={tiny_filter}", f"--output_dir={tmp_path / 'w'}"]
+    assert "--policy.memory is 1" in fails(capsys, "wrap", "--memory=1", *options) and not (tmp_path / "w").exists()
+    main(["wrap", "--memory=24", *options])
+    assert json.loads((tmp_path / "w" / "config.json").read_text())["memory"] == 24
+
+
 def test_wrap_refuses_a_retreat_that_cannot_be_before_it_writes(capsys, tiny_filter, tmp_path):
     options = [f"--policy.path={tiny_filter}", "--retreat={down.pos: -0.1}", f"--output_dir={tmp_path / 'w'}"]
     assert "retreat moves down.pos; the actions are turn_rate.vel" in fails(capsys, "wrap", *options)

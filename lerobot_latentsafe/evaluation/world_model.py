@@ -105,8 +105,7 @@ def imagined_episodes(
         verdicts: balanced accuracy of "fails within `horizon` steps"; shuffled: the same under other episodes' actions;
         false_alarms: of the episodes that do not fail; hold_false_alarms: of holding still instead.
     """
-    first = np.array([np.flatnonzero(reader.labels.episode == e)[0] for e in episodes])
-    clip = reader.cut(first, policy, length=horizon + 1)
+    clip = _from_the_start(policy, reader, episodes, horizon + 1)
     kept = clip.failure[:, 0] == SAFE
     failed = ((clip.failure == FAILING) & clip.valid).any(1)[kept].cpu().numpy()
     percepts = {key: value[kept, 0] for key, value in clip.percepts.items()}
@@ -137,9 +136,8 @@ def foreseen_along(policy: LatentSafePolicy, reader: ClipReader, episodes: np.nd
         failing, safe: states, themselves safe, after which the episode fails within AHEAD steps or does not; missed,
         false_alarms: of these, or None where there are none.
     """
-    first = np.array([np.flatnonzero(reader.labels.episode == e)[0] for e in episodes])
-    longest = int(np.unique(reader.labels.episode[reader.labels.episode >= 0], return_counts=True)[1].max())
-    clip, belief, verdicts, outcomes = reader.cut(first, policy, length=longest), Belief(), [], []
+    longest = max(int((reader.labels.episode == e).sum()) for e in episodes)
+    clip, belief, verdicts, outcomes = _from_the_start(policy, reader, episodes, longest), Belief(), [], []
     for t in range(longest - AHEAD):
         belief = belief.after(lambda latent: _seen(policy, latent, clip, t), policy.config.memory)  # noqa: B023
         kept = (clip.failure[:, t] == SAFE) & clip.valid[:, t + AHEAD]
@@ -157,6 +155,12 @@ def foreseen_along(policy: LatentSafePolicy, reader: ClipReader, episodes: np.nd
         "missed": wilson(int((~verdict[failed]).sum()), int(failed.sum())) if failed.any() else None,
         "false_alarms": wilson(int(verdict[~failed].sum()), int((~failed).sum())) if not failed.all() else None,
     }
+
+
+def _from_the_start(policy: LatentSafePolicy, reader: ClipReader, episodes: np.ndarray, length: int) -> Clip:
+    """The first frames of each episode."""
+    first = np.array([np.flatnonzero(reader.labels.episode == e)[0] for e in episodes])
+    return reader.cut(first, policy, length=length)
 
 
 def _seen(policy: LatentSafePolicy, latent: Latent | None, clip: Clip, t: int) -> Latent:
