@@ -26,6 +26,7 @@ from lerobot_latentsafe.evaluation.bag import (
     as_job,
     drive,
     in_short,
+    in_use,
     run_cells,
     summary,
     traces,
@@ -92,8 +93,7 @@ def main() -> None:
             print(f"{variant}, {name}: {in_short(cell)}")
     panels = {variant: traces(runs[variant, settings[0]]) for variant in table}
     save(value_profiles(panels, settings[0].epsilon, scene(SEEN).fps), arguments.output.with_suffix(".png"))
-    used = {s.path: {"law": s.law, "epsilon": s.epsilon, "guard": s.guard, "release": s.release} for s in settings}
-    write_json(arguments.output, {**table, "filters": used, **made_by})
+    write_json(arguments.output, {**table, "law": arguments.law, "filters": in_use(settings), **made_by})
 
 
 if __name__ == "__main__":

@@ -18,4 +18,4 @@ done
   --root="$OUT/bag_retreats" --seed=31 --n_episodes=100
 # Interrupted where the committed filter would act.
 [ -e "$OUT/bag_shielded" ] || .venv/bin/latentsafe collect --source=bag_shielded --repo_id=latentsafe/bag_shielded \
-  --root="$OUT/bag_shielded" --seed=29 --n_episodes=75
+  --root="$OUT/bag_shielded" --seed=29 --n_episodes=100

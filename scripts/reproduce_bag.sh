@@ -14,9 +14,15 @@ record() { # name source seed [episodes]
     ${4:+--n_episodes="$4"}
 }
 
+timed() { # name command... : user and system CPU seconds of the command go to $OUT/cost.csv
+  local name=$1; shift
+  TIMEFORMAT="$name,%U,%S"
+  { time "$@" 2>&3; } 3>&2 2>>"$OUT/cost.csv"
+}
+
 tokens() { # name [other options of latentsafe cache]
   local name=$1; shift
-  [ -e "$DATA/${name}_tokens/frame_cache/manifest.json" ] || $BIN/latentsafe cache --encoder=auto \
+  [ -e "$DATA/${name}_tokens/frame_cache/manifest.json" ] || timed "tokens_$name" $BIN/latentsafe cache --encoder=auto \
     --dataset.repo_id="latentsafe/$name" --dataset.root="$DATA/$name" --output_dir="$DATA/${name}_tokens" "$@"
 }
 
@@ -24,17 +30,17 @@ filter() { # seed
   local wm="$OUT/wm_$1" data="--dataset.repo_id=latentsafe/bag_cache --dataset.root=$DATA/bag_tokens"
   local last="$wm/checkpoints/last/pretrained_model"
   if [ -e "$wm/checkpoints/last" ] && [ ! -e "$wm/done" ]; then
-    $BIN/lerobot-train --config_path="$last/train_config.json" --resume=true
+    timed "world_model_$1" $BIN/lerobot-train --config_path="$last/train_config.json" --resume=true
   elif [ ! -e "$wm/done" ]; then
     rm -rf "$wm"
-    $BIN/lerobot-train --config_path=configs/bag_gru.yaml $data --policy.frame_cache="$DATA/bag_tokens" \
+    timed "world_model_$1" $BIN/lerobot-train --config_path=configs/bag_gru.yaml $data --policy.frame_cache="$DATA/bag_tokens" \
       --output_dir="$wm" --seed="$1"
   fi
   touch "$wm/done"
-  [ -e "$OUT/margin_$1/integrity.json" ] || $BIN/latentsafe train-margin --policy.path="$last" $data \
+  [ -e "$OUT/margin_$1/integrity.json" ] || timed "margin_$1" $BIN/latentsafe train-margin --policy.path="$last" $data \
     --output_dir="$OUT/margin_$1" --seed="$1"
-  [ -e "$OUT/filter_$1/integrity.json" ] || $BIN/latentsafe train-reachability --policy.path="$OUT/margin_$1" $data \
-    --output_dir="$OUT/filter_$1" --seeds="[$1]"
+  [ -e "$OUT/filter_$1/integrity.json" ] || timed "reachability_$1" $BIN/latentsafe train-reachability \
+    --policy.path="$OUT/margin_$1" $data --output_dir="$OUT/filter_$1" --seeds="[$1]"
   [ -e "$OUT/final_$1" ] || $BIN/latentsafe wrap --policy.path="$OUT/filter_$1" --output_dir="$OUT/final_$1" --half=true
 }
 
@@ -51,7 +57,8 @@ record bag_policies bag_policies 23 120
 record bag_lifts_more bag_lifts 22 80
 record bag_pulls bag_pulls 25 100
 record bag_retreats bag_retreats 31 80
-record bag_shielded bag_shielded 29 40 # interrupted where the committed bag would act; when these were made, that of f751ddf
+record bag_shielded bag_shielded 29 100 # interrupted where the committed bag would act; when these were made, that of 6cf0280
+record bag_shielded_more bag_shielded 33 60
 record bag_strong bag_strong 0
 record bag_weak bag_weak 0
 record held_branches bag_branches 1 50
@@ -64,7 +71,7 @@ import sys
 from pathlib import Path
 from lerobot.datasets.aggregate import aggregate_datasets
 data = Path(sys.argv[1])
-names = "mix branches climbs lifts middle between dither clumsy policies lifts_more pulls retreats shielded"
+names = "mix branches climbs lifts middle between dither clumsy policies lifts_more pulls retreats shielded shielded_more"
 parts = [f"bag_{name}" for name in names.split()]
 aggregate_datasets([f"latentsafe/{p}" for p in parts], "latentsafe/bag", [data / p for p in parts], data / "bag.begun")
 (data / "bag.begun").rename(data / "bag")

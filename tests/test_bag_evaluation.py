@@ -86,6 +86,13 @@ def test_a_setting_is_the_filters_own_unless_given(setting):
     assert (config.law, config.epsilon, config.guard) == ("plan", 0.25, 2)
 
 
+def test_a_table_notes_how_its_filters_remember_and_retreat(setting, tmp_path):
+    assert bag.in_use([setting]) == {setting.path: {"epsilon": 0.25, "guard": 2, "release": -1.0}}
+    ways = {"memory": 24, "retreat": {"delta_z.pos": -0.006}, "patience": 1, "dwell": 6}
+    other = bag.FilterSetting.of(str(tiny.save_franka_filter(tmp_path / "filter", scene="bag", **ways)), "margin")
+    assert bag.in_use([other])[other.path].items() >= ways.items()
+
+
 def test_an_overridden_operator_goes_on_trying(scene, setting, monkeypatch):
     monkeypatch.setattr(bag, "STEPS", 4)
     always = bag.FilterSetting.of(setting.path, "margin", epsilon=2.0)

@@ -109,6 +109,7 @@ def test_a_recording_is_replayed_on_every_variant(script, filter_path, tmp_path)
     module.main()
     rows = json.loads(output.read_text())
     assert rows["red"]["bare"]["spilled"]["k"] == 0 and rows["heavy"]["pooled"]["overridden_share"] == 1.0
+    assert rows["law"] == "margin" and rows["filters"][filter_path]["guard"] == 1
     assert len(module.recording(SEEDS[0])) == STEPS and output.with_suffix(".png").exists()
 
 

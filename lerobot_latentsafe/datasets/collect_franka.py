@@ -76,8 +76,8 @@ class Source:
         return str(np.random.default_rng(0).permutation(names)[episode % len(names)])
 
 
-POLICIES = {"bag_diffusion_weak": 150, "bag_diffusion_strong": 50}
-"""Of the bag, as committed; the weak one spills, of which there is more to learn."""
+WEAK, STRONG = "bag_diffusion_weak", "bag_diffusion_strong"
+"""The committed policies of the bag."""
 
 SOURCES: dict[str, Source] = {
     "bag_mix": Source("bag", {"random": 1000, "open_end": 75, "middle": 75, "closed_end": 100, "side_to_side": 50}),
@@ -89,8 +89,9 @@ SOURCES: dict[str, Source] = {
         "bag", {"dither": 200, "branch": 100, "rise": 100}, branches=1, grasps=HELD_ANYWHERE, clumsiness=CLUMSINESS
     ),
     "bag_clumsy": Source("bag", {"clumsy": 120}),
-    "bag_policies": Source("bag", POLICIES, policies=True, hand=BRIEF, seconds=10.0),
-    "bag_shielded": Source("bag", POLICIES, policies=True, hand=RETREATING, shield="bag", seconds=10.0),
+    # The weak one spills, of which there is more to learn; of the strong one, what is stopped without need.
+    "bag_policies": Source("bag", {WEAK: 150, STRONG: 50}, policies=True, hand=BRIEF, seconds=10.0),
+    "bag_shielded": Source("bag", {WEAK: 50, STRONG: 150}, policies=True, hand=RETREATING, shield="bag", seconds=10.0),
     "bag_retreats": Source(
         "bag", {"open_end": 80, "middle": 30, "closed_end": 90}, astray=0.3, hand=RETREATING, seconds=8.0
     ),
