@@ -1,5 +1,6 @@
 import json
 import shutil
+import sys
 import threading
 from http.server import BaseHTTPRequestHandler, HTTPServer
 
@@ -142,3 +143,10 @@ def test_unknown_labeller_is_a_message(name):
 
 def test_your_own_function_is_found():
     assert find_labeller("json:loads") is json.loads
+
+
+def test_a_labeller_beside_the_user_is_found(tmp_path, monkeypatch):
+    (tmp_path / "labels_of_mine.py").write_text("def first(episode):\n    return 0\n")
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.chdir(tmp_path)
+    assert find_labeller("labels_of_mine:first")(None) == 0

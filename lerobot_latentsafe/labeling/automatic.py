@@ -7,6 +7,8 @@ named on the command line as `dubins_truth` (here) or `my_module:my_function`; `
 import base64
 import importlib
 import json
+import os
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
@@ -170,7 +172,7 @@ def _data_url(picture: np.ndarray) -> str:
 
 
 def find_labeller(name: str) -> Labeller:
-    """A labeller of this module, or `module:function`.
+    """A labeller of this module, or `module:function` of a module that is installed or in the present folder.
 
     Raises:
         ValueError: there is none of that name.
@@ -178,6 +180,8 @@ def find_labeller(name: str) -> Labeller:
     if name == "dubins_truth":
         return dubins_truth
     module, _, function = name.partition(":")
+    if (here := os.getcwd()) not in sys.path:  # a console command's own folder is searched, not the user's
+        sys.path.append(here)
     try:
         return getattr(importlib.import_module(module), function)
     except (ImportError, AttributeError, ValueError) as e:
