@@ -8,6 +8,7 @@ OUT=${1:-outputs/bag} DATA=${DATA:-data} SEEDS=${SEEDS:-0 1 2}
 BIN=.venv/bin
 export HF_HUB_OFFLINE=1 OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
 mkdir -p "$OUT"
+[ -e "$OUT/cost.csv" ] || echo "step,user_s,system_s" >"$OUT/cost.csv"
 
 record() { # name source seed [episodes]
   [ -e "$DATA/$1" ] || $BIN/latentsafe collect --source="$2" --repo_id="latentsafe/$1" --root="$DATA/$1" --seed="$3" \
