@@ -61,12 +61,8 @@ from pathlib import Path
 from typing import Any
 
 PROVENANCE = ("command", "commit", "seeds", "cpu_minutes")
-CODE = re.compile(
-    r"^(?P<indent> *)(?P<fence>`{3,}|~{3,})(?![`~{]).*?^(?P=indent)(?P=fence)"
-    r"|(?P<ticks>`+)(?!`).+?(?<!`)(?P=ticks)(?!`)",
-    re.DOTALL | re.MULTILINE,
-)
-"""Fenced blocks, but for MyST's directives (```{note}), and code within a line."""
+FENCE = re.compile(r"\s*(?P<fence>`{3,}|~{3,})(?P<info>.*)")
+SPAN = re.compile(r"(?<!`)(?P<ticks>`{1,2})(?!`)(?:(?!\n\s*\n).)+?(?<!`)(?P=ticks)(?!`)", re.DOTALL)
 TOKEN = re.compile(r"<!--\s*=(?P<expression>.*?)(?:-->|\Z)|<!--\s*/\s*-->", re.DOTALL)
 LINE_START = re.compile(r"\s*(?:[-*+>]\s+|\d+[.)]\s+)*")
 
@@ -197,7 +193,7 @@ REDUCTIONS: dict[str, Callable[[list[float]], float]] = {
     "mean": lambda values: sum(values) / len(values),
     "min": min,
     "max": max,
-    "ratio": lambda values: two(values)[0] / two(values)[1],
+    "ratio": lambda values: divided(*two(values)),
     "difference": lambda values: two(values)[0] - two(values)[1],
 }
 
@@ -207,6 +203,13 @@ def two(values: list[float]) -> list[float]:
     if len(values) != 2:
         raise PageError(f"ratio and difference take two entries, not {len(values)}; write {{first,second}} in the path")
     return values
+
+
+def divided(a: float, b: float) -> float:
+    """Their ratio."""
+    if not b:
+        raise PageError("the second entry is 0; nothing can be divided by it")
+    return a / b
 
 
 def evaluate(expression: str, root: Path) -> str:
@@ -242,9 +245,29 @@ def pages(root: Path) -> list[Path]:
     return [p for p in (root / "README.md", *docs) if p.is_file()]
 
 
+def without_code(text: str) -> str:
+    """A page with spaces where it shows code. MyST directives (```{note}) hold no code, code cells do."""
+    lines: list[str] = []
+    fences: list[tuple[str, bool]] = []  # the open ones, and whether they hold code
+    for line in text.splitlines(keepends=True):
+        fence, inside = FENCE.match(line), bool(fences) and fences[-1][1]
+        if fence and fences and fence["fence"].startswith(fences[-1][0]) and not fence["info"].strip():
+            fences.pop()
+        elif fence and not inside:
+            info = fence["info"].strip()
+            fences.append((fence["fence"], not info.startswith("{") or info.startswith("{code")))
+        lines.append(blank(line) if fence or inside else line)
+    return SPAN.sub(lambda span: blank(span[0]), "".join(lines))
+
+
+def blank(text: str) -> str:
+    """As many spaces, on as many lines."""
+    return re.sub(r"[^\n]", " ", text)
+
+
 def markers(text: str) -> Iterator[Marker | tuple[int, str, str]]:
     """Each marker of a page; of one that is not well-formed its line, its expression and what is wrong with it."""
-    text = CODE.sub(lambda code: re.sub(r"[^\n]", " ", code[0]), text)
+    text = without_code(text)
     tokens = [*TOKEN.finditer(text)]
     for token, following in zip(tokens, [*tokens[1:], None]):
         line, expression = text.count("\n", 0, token.start()) + 1, token["expression"]
@@ -360,6 +383,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--show", metavar="EXPR", help="print what an expression gives")
     parser.add_argument("--root", type=Path, default=Path(__file__).parents[1], help="of the repository")
     args = parser.parse_args(argv)
+    read.cache_clear()
     try:
         lines = [] if args.show else check(args.root) if args.check else rewrite(args.root)
         if args.show:
