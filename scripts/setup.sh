@@ -13,7 +13,7 @@ else
     rm -rf .tools
     if ! python3 -m pip install --quiet --target .tools/lib uv; then
       echo "setup: cannot install uv. Install pip first (Debian: apt-get install python3-pip python3-venv)," >&2
-      echo "       or uv itself (https://docs.astral.sh/uv), then run make setup again." >&2
+      echo "       or uv itself (macOS: brew install uv; else https://docs.astral.sh/uv), then run make setup again." >&2
       exit 1
     fi
     uv=.tools/lib/bin/uv
@@ -29,7 +29,11 @@ if ! "$uv" venv --quiet --clear --python 3.12 .venv; then
   echo "       then run make setup again." >&2
   exit 1
 fi
-"$uv" pip install --quiet --python .venv/bin/python -r requirements.lock
+if ! "$uv" pip install --quiet --python .venv/bin/python -r requirements.lock; then
+  echo "setup: cannot install what requirements.lock pins. Its packages exist for Linux (x86-64 and aarch64), macOS" >&2
+  echo "       (Apple silicon) and Windows (x86-64). If this is one of them, the reason is above; run make setup again." >&2
+  exit 1
+fi
 "$uv" pip install --quiet --python .venv/bin/python --no-deps -e .
 touch "$stamp"
 echo "installed into .venv"
