@@ -4,10 +4,10 @@ Importing this package registers the policy, environments, robots, teleoperators
 registries, and loads nothing heavy: models and simulators are imported when they are used.
 """
 
-from lerobot_latentsafe.baselines.dreamer.configuration_dreamer import LatentSafeDreamerConfig
 from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
 from lerobot_latentsafe.envs.configuration_envs import LatentSafeBagEnv, LatentSafeBlocksEnv, LatentSafeDubinsEnv
-from lerobot_latentsafe.perceive import PerceiveStep
+from lerobot_latentsafe.policies.dreamer.configuration_dreamer import LatentSafeDreamerConfig
+from lerobot_latentsafe.policies.grasp_prediction import PerceiveStep
 from lerobot_latentsafe.robots.franka.config_franka import LatentSafeFrankaConfig
 from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
 from lerobot_latentsafe.robots.shielded.config_shielded import LatentSafeShieldedConfig

@@ -4,15 +4,16 @@ On a recorded episode that ends in failure, a monitor with threshold epsilon war
 V <= epsilon. Too small an epsilon warns late or never; too large a one cries wolf on episodes that never fail.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import torch
 
+from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
 from lerobot_latentsafe.datasets.clips import ClipReader
 from lerobot_latentsafe.datasets.labels import FAILING
-from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
-from lerobot_latentsafe.world_models.base import map_latent
+from lerobot_latentsafe.latent import map_latent
+from lerobot_latentsafe.safety_model import SafetyModel
 
 
 @dataclass
@@ -36,13 +37,13 @@ class Calibration:
 
 
 @torch.no_grad()
-def episode_values(policy: LatentSafePolicy, reader: ClipReader, episodes: np.ndarray) -> list[dict[str, np.ndarray]]:
+def episode_values(model: SafetyModel, reader: ClipReader, episodes: np.ndarray) -> list[dict[str, np.ndarray]]:
     """V and labels along whole episodes, filtered from their first frame: {value (T,), failure (T,)} each."""
     rows = []
     for episode in episodes:
         index = np.flatnonzero(reader.labels.episode == episode)
-        latents = policy.world_model.encode(reader.cut(index[:1], policy, length=len(index)))
-        value = policy.value(map_latent(latents, lambda t: t[0]))
+        clip = reader.cut(index[:1], model.world_model.percept_names, length=len(index))
+        value = model.value(map_latent(model.world_model.encode(clip), lambda t: t[0]))
         rows.append({"value": value.cpu().numpy(), "failure": reader.labels.failure[index]})
     return rows
 
@@ -84,7 +85,7 @@ def calibrate(rows: list[dict[str, np.ndarray]], max_missed: float = 0.05, lead_
     )
 
 
-def store(policy: LatentSafePolicy, calibration: Calibration) -> None:
-    """Set the policy's epsilon and keep the evidence in its config."""
-    policy.config.epsilon = calibration.epsilon
-    policy.config.calibration = {k: float(v) for k, v in asdict(calibration).items()}
+def store(config: LatentSafeConfig, calibration: Calibration) -> None:
+    """Set the threshold of a filter, and keep the evidence beside it."""
+    evidence = {k: float(v) for k, v in asdict(calibration).items()}
+    config.change(law=replace(config.law, epsilon=calibration.epsilon), calibration=evidence)

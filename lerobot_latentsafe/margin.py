@@ -1,10 +1,36 @@
 """The failure margin l: a classifier on latent features whose zero-sublevel set is the failure set (Eq. 3)."""
 
+from dataclasses import dataclass
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from lerobot_latentsafe.ranks import mean_over_ranks
+from lerobot_latentsafe.runtime.distributed import mean_over_ranks
+
+
+@dataclass
+class MarginConfig:
+    """The failure margin and its training.
+
+    Attributes:
+        hidden, layers: its MLP (2 layers of 16 in the paper).
+        delta: delta of Eq. 3.
+        weight: weight of Eq. 3 in the training loss; 0 leaves the margin to `latentsafe train-margin`.
+        clips: windows of the data that `latentsafe train-margin` fits the margin to.
+        failure_specification: name of the failure labels: a dataset column or a sidecar file.
+    """
+
+    hidden: int = 16
+    layers: int = 2
+    delta: float = 0.75
+    weight: float = 10.0
+    clips: int = 10_000
+    failure_specification: str = "failure"
+
+    def __post_init__(self) -> None:
+        if self.delta <= 0:
+            raise ValueError(f"--policy.margin.delta is {self.delta}; expected a positive number")
 
 
 class FailureMargin(nn.Module):

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 from huggingface_hub import ModelCard, ModelCardData
 
 from lerobot_latentsafe.configuration_latentsafe import LAWS, RECENT, LatentSafeConfig
-from lerobot_latentsafe.evaluation.report import share
+from lerobot_latentsafe.reports.html import share
 
 if TYPE_CHECKING:
-    from lerobot_latentsafe.baselines.dreamer.configuration_dreamer import LatentSafeDreamerConfig
+    from lerobot_latentsafe.policies.dreamer.configuration_dreamer import LatentSafeDreamerConfig
 
 TEXT = """---
 {header}

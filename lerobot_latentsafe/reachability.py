@@ -9,16 +9,14 @@ V(z) = min(l(z), max_a Q(z, a)), where Q(z, a) is the value *after* a: Q(z, a) =
 import copy
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from itertools import pairwise
 from typing import Protocol
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from lerobot_latentsafe.margin import FailureMargin
-from lerobot_latentsafe.ranks import any_rank, from_first_rank, gathered, share, sum_over_ranks
-from lerobot_latentsafe.world_models.base import Latent, WorldModel, map_latent, replace_rows, select
+from lerobot_latentsafe.critic import ReachabilityConfig, SafetyCritic, safety_bellman_target
+from lerobot_latentsafe.latent import Latent, map_latent, replace_rows, select
+from lerobot_latentsafe.runtime.distributed import any_rank, from_first_rank, gathered, share, sum_over_ranks
 
 Starts = Callable[[int], Latent]
 """Draws a batch of latents from which imagination starts: encoded dataset windows. Of several ranks, each gets its
@@ -48,210 +46,6 @@ class Imagination(Protocol):
 
     def complete(self, latent: Latent, action: Tensor) -> Tensor:
         """The action (B, A) with the commands that a fallback leaves as they were before this latent."""
-
-
-class LatentImagination:
-    """A world model and failure margin behind the `Imagination` protocol.
-
-    Args:
-        kept: bool (A,), commands that a fallback keeps as they were, such as a gripper's.
-        sampled: draw what comes next from the world model's distribution, instead of its mean or mode.
-    """
-
-    def __init__(self, world_model: WorldModel, margin: FailureMargin, kept: Tensor, sampled: bool = False):
-        self.world_model, self.failure_margin, self.kept, self.sampled = world_model, margin, kept, sampled
-
-    def step(self, latent: Latent, action: Tensor) -> Latent:
-        step = self.world_model.sample_step if self.sampled else self.world_model.step
-        return step(latent, action)
-
-    def features(self, latent: Latent) -> Tensor:
-        return self.world_model.features(latent)
-
-    def ended(self, latent: Latent) -> Tensor:
-        return self.world_model.ended(latent)
-
-    def margin(self, latent: Latent) -> Tensor:
-        return self.failure_margin.bounded(self.world_model.features(latent))
-
-    def complete(self, latent: Latent, action: Tensor) -> Tensor:
-        return torch.where(self.kept.to(action.device), latent["action"], action)
-
-
-def safety_bellman_target(margin: Tensor, next_value: Tensor, gamma: float) -> Tensor:
-    """Eq. 5, the time-discounted safety Bellman backup: (1 - gamma) l + gamma min(l, V').
-
-    gamma = 0 gives the margin itself, gamma -> 1 the undiscounted minimum over time.
-    """
-    return (1 - gamma) * margin + gamma * torch.minimum(margin, next_value)
-
-
-def risk_bellman_target(margin: Tensor, next_value: Tensor, gamma: float) -> Tensor:
-    """SQRL's backup for V = -risk: -(c + (1 - c) gamma risk'), where c is 1 in failures (l < 0), else 0.
-
-    The risk is the discounted probability of failing; a value above 0, such as infinity, says that none is ahead.
-    """
-    return torch.where(margin >= 0, gamma * next_value.clamp(-1, 0), -1.0)  # what is no number has failed
-
-
-BACKUPS: dict[str, Callable[[Tensor, Tensor, float], Tensor]] = {
-    "reachability": safety_bellman_target,
-    "risk": risk_bellman_target,
-}
-"""What a critic can be trained for: (margin, next value, gamma) -> value, all but gamma of one shape."""
-
-
-@dataclass
-class ReachabilityConfig:
-    """Sizes and schedule of the reachability actor-critic.
-
-    Attributes:
-        critic_hidden, actor_hidden: widths of the hidden layers.
-        activation: `tanh` or `relu`.
-        coverage: share of the data's actions left out at either end of the range that a continuous fallback may use:
-            where actions are rare in the data, the world model only guesses.
-        components: principal components of the features that actor and critic read.
-        horizon: imagined steps before a start is drawn anew (at most 25 in the paper).
-        kept: the first steps of these whose states are learned on; the later ones only say what came of them. That
-            keeps the pool full of encoded observations, which is where the filter will ask.
-        steps: gradient steps.
-        batch_size: imagined states a gradient step; with discrete actions each is backed up under all of them.
-        lr, actor_lr: AdamW step sizes, decayed over the second half.
-        actor_through: what a continuous actor climbs: `critic`, Q(z, a) of the states in the pool; or `world_model`,
-            the value of the latent that the world model predicts, through its gradient.
-        gamma: the final discount; 1 - gamma is annealed from `gamma_start` geometrically over `anneal` of the run,
-            after `warmup` of the run at gamma = 0.
-        caution: weight of overestimates of V in the squared error, relative to underestimates.
-        tau: rate of the target network.
-        pool: imagined states kept; a part is imagined anew every `refresh` steps.
-        greedy: share of imagined trajectories that follow the current fallback policy, which lets imagination visit
-            what the fallback would see; the others act at random, each action held for 1 / `switch` steps on average.
-    """
-
-    critic_hidden: tuple[int, ...] = (128, 128, 128)
-    actor_hidden: tuple[int, ...] = (256, 256)
-    activation: str = "relu"
-    coverage: float = 0.02
-    components: int = 16
-    horizon: int = 25
-    kept: int = 8
-    steps: int = 12_000
-    batch_size: int = 512
-    lr: float = 1e-3
-    actor_lr: float = 3e-4
-    actor_through: str = "critic"
-    gamma: float = 0.9999
-    gamma_start: float = 0.8
-    warmup: float = 0.04
-    anneal: float = 0.26
-    caution: float = 2.0
-    tau: float = 0.05
-    pool: int = 131_072
-    refresh: int = 250
-    greedy: float = 0.5
-    switch: float = 0.1
-
-    def __post_init__(self) -> None:
-        if self.actor_through not in ("critic", "world_model"):
-            raise ValueError(f"actor_through is {self.actor_through!r}; expected critic or world_model")
-
-
-def _mlp(sizes: list[int], activation: str) -> nn.Sequential:
-    layers: list[nn.Module] = []
-    for i, (n_in, n_out) in enumerate(pairwise(sizes)):
-        layers.append(nn.Linear(n_in, n_out))
-        if i < len(sizes) - 2:
-            layers.append({"tanh": nn.Tanh, "relu": nn.ReLU}[activation]())
-    return nn.Sequential(*layers)
-
-
-class SafetyCritic(nn.Module):
-    """Q(z, a) and the fallback policy over projected features, for a discrete or a continuous action space.
-
-    Args:
-        feature_dim: D.
-        action_dim: A.
-        candidates: (K, A) in [-1, 1], the discrete action set, or None for continuous actions.
-        low, high: (A,) in [-1, 1], the range of a continuous policy's commands; by default all of it.
-        target: which of `BACKUPS` the values obey.
-    """
-
-    def __init__(
-        self,
-        feature_dim: int,
-        action_dim: int,
-        candidates: Tensor | None,
-        config: ReachabilityConfig,
-        low: Tensor | None = None,
-        high: Tensor | None = None,
-        target: str = "reachability",
-    ):
-        super().__init__()
-        self.backup = BACKUPS[target]
-        n_components = min(config.components, feature_dim)
-        self.register_buffer("feature_mean", torch.zeros(feature_dim))
-        self.register_buffer("projection", torch.eye(feature_dim, n_components))
-        self.register_buffer("candidates", candidates)
-        self.register_buffer("low", -torch.ones(action_dim) if low is None else low, persistent=False)
-        self.register_buffer("high", torch.ones(action_dim) if high is None else high, persistent=False)
-        self.discrete = candidates is not None
-        n_out = len(candidates) if self.discrete else 1
-        n_in = n_components + (0 if self.discrete else action_dim)
-        self.q = _mlp([n_in, *config.critic_hidden, n_out], config.activation)
-        self.actor = (
-            None if self.discrete else _mlp([n_components, *config.actor_hidden, action_dim], config.activation)
-        )
-
-    def set_projection(self, features: Tensor) -> None:
-        """Read the leading principal components of these features (N, D), all on one scale.
-
-        A world model's latent holds far more numbers than the state has degrees of freedom. A critic of all of them,
-        each blown up to unit variance, fits its training states and errs on new ones.
-        """
-        self.feature_mean.copy_(features.mean(0))
-        _, spread, axes = torch.linalg.svd(features - self.feature_mean, full_matrices=False)
-        kept = self.projection.shape[1]
-        scale = spread[:kept].square().mean().sqrt() / len(features) ** 0.5
-        # An axis has no sign of its own: rounding errors, which differ among machines and ranks, would choose it.
-        largest = axes[:kept].gather(1, axes[:kept].abs().argmax(1, keepdim=True))
-        self.projection.copy_((axes[:kept] * largest.sign()).T / scale.clamp(min=1e-6))
-
-    def project(self, features: Tensor) -> Tensor:
-        """Features (..., D) -> what q and actor read (..., C)."""
-        return (features - self.feature_mean) @ self.projection
-
-    def held_actions(self, still: Tensor | None = None) -> Tensor:
-        """(K, A) actions worth holding: the candidates, or standing still (1, A) and the extremes of each command."""
-        if self.discrete:
-            return self.candidates
-        extremes = [torch.diag(bound)[bound != 0] for bound in (self.high, self.low)]
-        return torch.cat([torch.zeros_like(self.low)[None] if still is None else still, *extremes])
-
-    def between(self, share: Tensor) -> Tensor:
-        """Continuous actions at these shares in [0, 1] of their ranges: (..., A)."""
-        return torch.lerp(self.low, self.high, share)
-
-    def best_q(self, x: Tensor) -> Tensor:
-        """max_a Q over projected features (..., D) -> (...,)."""
-        return self.q(x).amax(-1) if self.discrete else self.q_of(x, self.act(x))
-
-    def q_of(self, x: Tensor, action: Tensor) -> Tensor:
-        """Q(z, a) for continuous actions (..., A), of which only the commands that this policy moves are read."""
-        return self.q(torch.cat([x, action * (self.high > self.low)], -1)).squeeze(-1)
-
-    def act(self, x: Tensor) -> Tensor:
-        """The fallback action argmax_a Q in [-1, 1]: (..., D) -> (..., A)."""
-        if self.discrete:
-            return self.candidates[self.q(x).argmax(-1)]
-        return self.between(torch.sigmoid(2 * self.actor(x)))
-
-    def value(self, features: Tensor, margin: Tensor) -> Tensor:
-        """V = min(l, max_a Q) at raw features (..., D) with bounded margin (...,); a risk's is -1 where l < 0."""
-        return self.backup(margin, self.best_q(self.project(features)), 1.0)
-
-    def fallback(self, features: Tensor) -> Tensor:
-        """Safety-preserving action in [-1, 1] at raw features: (..., D) -> (..., A)."""
-        return self.act(self.project(features))
 
 
 @torch.no_grad()
@@ -328,8 +122,8 @@ class LatentReachability:
         fused = critic.feature_mean.device.type in ("cpu", "cuda")
         self.optimizer = torch.optim.AdamW(groups, weight_decay=0.0, fused=fused)
         self.step_count = 0
-        self.kept = min(config.kept, config.horizon)
-        self.chunk = max(1, min(2048, config.pool // self.kept))
+        self.learned_steps = min(config.learned_steps, config.horizon)
+        self.chunk = max(1, min(2048, config.pool // self.learned_steps))
         self.pool: dict[str, Tensor] = {}
         self._fill_pool()
 
@@ -337,7 +131,7 @@ class LatentReachability:
 
     @torch.no_grad()
     def imagine(self) -> dict[str, Tensor]:
-        """Roll `chunk` starts out for `horizon` steps and keep the first `kept` of them.
+        """Roll `chunk` starts out for `horizon` steps and keep the first `learned_steps` of them.
 
         Returns:
             x (N, C) projected features and the action taken (N, A); next_x (N, K, C), next_l and ended (N, K), where
@@ -355,7 +149,7 @@ class LatentReachability:
             held = torch.where((self._rand() < config.switch)[:, None], self._random_actions(), held)
             action, choice = self._explore(x, greedy, held)
             action = self.imagination.complete(latent, action)
-            if critic.discrete and t < self.kept:
+            if critic.discrete and t < self.learned_steps:
                 tried = critic.candidates.unsqueeze(0).expand(n, -1, -1)
             else:
                 tried, choice = action[:, None], torch.zeros_like(choice)
@@ -378,7 +172,7 @@ class LatentReachability:
             if any_rank(ended[taken].any()):
                 latent = replace_rows(latent, self.starts(self.chunk), where=ended[taken])
         self._add_outcomes(rows)
-        columns = {key: torch.stack([row[key] for row in rows[: self.kept]], 1) for key in rows[0]}
+        columns = {key: torch.stack([row[key] for row in rows[: self.learned_steps]], 1) for key in rows[0]}
         return {key: gathered(column).transpose(0, 1).flatten(0, 1) for key, column in columns.items()}
 
     @staticmethod
@@ -432,7 +226,7 @@ class LatentReachability:
         for tensor in self.critic.state_dict().values():
             from_first_rank(tensor)  # the same to the last bit, whatever computes the others
         self.target.load_state_dict(self.critic.state_dict())
-        n_chunks = max(1, self.config.pool // (self.chunk * self.kept))
+        n_chunks = max(1, self.config.pool // (self.chunk * self.learned_steps))
         chunks = [self.imagine() for _ in range(n_chunks)]
         self.pool = {key: torch.cat([c[key] for c in chunks]) for key in chunks[0]}
         self._oldest = 0

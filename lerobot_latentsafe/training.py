@@ -1,21 +1,26 @@
 """Training on top of a frozen world model: the failure margin by itself, and reachability in imagination."""
 
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor
+from tqdm import trange
 
-from lerobot_latentsafe.checkpoint import INTEGRITY, WEIGHTS, seal
-from lerobot_latentsafe.datasets.clips import ClipReader
+from lerobot_latentsafe.datasets.clips import ClipReader, FilterData
+from lerobot_latentsafe.latent import Latent, map_latent, select
 from lerobot_latentsafe.margin import FailureMargin, hinge_loss
-from lerobot_latentsafe.memory import keep_freed_memory
-from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, adopt_dataset
-from lerobot_latentsafe.ranks import gathered, rank, share
+from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
 from lerobot_latentsafe.reachability import LatentReachability, Starts
-from lerobot_latentsafe.world_models.base import Latent, map_latent, select
+from lerobot_latentsafe.runtime.checkpoint import CONFIG
+from lerobot_latentsafe.runtime.distributed import gathered, rank, share
+from lerobot_latentsafe.runtime.files import refuse_existing
+from lerobot_latentsafe.runtime.hub import save_policy
+from lerobot_latentsafe.runtime.malloc import keep_freed_memory
+from lerobot_latentsafe.safety_model import SafetyModel
+from lerobot_latentsafe.units import adopt_dataset
 
 STARTS_BYTES = 2**30
 """Memory for the latents that imagination starts from; those of a transformer hold keys and values and are large."""
@@ -23,19 +28,19 @@ STARTS_BYTES = 2**30
 
 @torch.no_grad()
 def seen_and_imagined(
-    policy: LatentSafePolicy, reader: ClipReader, n_clips: int, generator: torch.Generator
+    model: SafetyModel, reader: ClipReader, n_clips: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
     """Features (N, D) and labels (N,) of random windows: a few frames are seen, the rest imagined as they were acted.
 
     A margin that has seen real latents alone is a stranger to imagined ones, and those are what a filter asks about. A
     quarter of the windows begin where episodes do, as whatever a filter sees does.
     """
-    world_model, rows = policy.world_model, []
+    world_model, rows = model.world_model, []
     _, begins = np.unique(reader.labels.episode, return_index=True)
     for _ in range(-(-n_clips // 64)):
         first = torch.randint(len(reader.labels.failure), (64,), generator=generator).numpy()
         first[:16] = begins[torch.randint(len(begins), (16,), generator=generator).numpy()]
-        clip = reader.cut(first, policy)
+        clip = reader.cut(first, world_model.percept_names)
         observed = int(torch.randint(1, clip.state.shape[1] + 1, (), generator=generator))
         latent = None
         for t in range(clip.state.shape[1]):
@@ -92,15 +97,15 @@ def train_margin(path: str | Path, dataset_meta, output_dir: Path, seed: int = 0
         UntrainedFilterError: the world model was never trained.
         FileExistsError: output_dir holds a checkpoint already.
     """
-    refuse_existing(output_dir)
+    refuse_existing(Path(output_dir) / CONFIG)
     policy, reader = load_with_cache(path, dataset_meta, seed)
     generator = torch.Generator().manual_seed(seed)
-    config, started = policy.config, time.process_time()
-    features, failure = seen_and_imagined(policy, reader, config.margin_clips, generator)
-    policy.margin = FailureMargin(features.shape[1], config.margin_hidden, config.margin_layers).to(policy.device)
-    fit_margin(policy.margin, features, failure, config.margin_delta, generator)
-    config.stage, config.frame_cache = "world_model", None
-    save_filter(policy, output_dir)
+    model, config, started = policy.model, policy.config, time.process_time()
+    features, failure = seen_and_imagined(model, reader, config.margin.clips, generator)
+    model.margin = model.new_margin()
+    fit_margin(model.margin, features, failure, config.margin.delta, generator)
+    config.change(trained_on=replace(config.trained_on, stage="world_model"), frame_cache=None)
+    save_policy(policy, output_dir)
     print(f"margin: {time.process_time() - started:.0f} CPU-s")
     return policy
 
@@ -113,18 +118,23 @@ def load_with_cache(path: str | Path, dataset_meta, seed: int = 0) -> tuple[Late
         ValueError: the dataset is another robot's, or not cached.
     """
     torch.manual_seed(seed)
-    policy = LatentSafePolicy.from_pretrained(path)
-    policy.require_stage("world_model")
-    adopt_dataset(policy.config, dataset_meta, dataset_meta.stats)
-    policy.config.frame_cache = None  # that of the first stage may be gone; the dataset brings its own
-    reader = ClipReader.of_dataset(policy.config, dataset_meta)
+    policy = load_filter(path)
+    config, trained_on = policy.config, policy.config.trained_on
+    policy.model.require_stage("world_model")
+    adopt_dataset(trained_on, dataset_meta, dataset_meta.stats)
+    # The cache of the first stage may be gone; the dataset brings its own.
+    specification, size = config.margin.failure_specification, config.world_model.image_size
+    data = FilterData.open(dataset_meta, specification, None, size, trained_on.cameras)
+    data.check_cameras({key: config.input_features[key].shape for key in data.cameras})
+    reader = data.reader(config.world_model.clip_length, policy.model.units)
     reader.require_cache()
+    config.world_model.of_cache(data.cache.manifest)
     return policy, reader
 
 
 @torch.no_grad()
 def encoded_starts(
-    policy: LatentSafePolicy, reader: ClipReader, generator: torch.Generator, max_frames: int = 100_000
+    model: SafetyModel, reader: ClipReader, generator: torch.Generator, max_frames: int = 100_000
 ) -> Starts:
     """Where imagination starts: encodings of random dataset windows, half of a single frame, half of a history.
 
@@ -135,37 +145,38 @@ def encoded_starts(
     Returns:
         A sampler of latents. Several ranks encode a share each and gather all.
     """
-    latent_bytes = sum(t.nbytes for t in policy.world_model.initial(1).values())
+    world_model, units = model.world_model, model.units
+    latent_bytes = sum(t.nbytes for t in world_model.initial(1).values())
     max_frames = min(max_frames, STARTS_BYTES // (2 * latent_bytes))  # two latents of each
-    n, length = len(reader.labels.failure), policy.config.world_model.clip_length
+    n, length = len(reader.labels.failure), world_model.config.clip_length
     offset = int(torch.randint(length, (1,), generator=generator))
     first = np.arange(offset, n, length)
     first = first[torch.randperm(len(first), generator=generator)[: max(1, max_frames // length)].numpy()]
     single, filtered = [], []
     first = share(torch.from_numpy(first)).numpy()
     for chunk in np.array_split(first, max(1, len(first) // 64)):
-        clip = reader.cut(chunk, policy)
+        clip = reader.cut(chunk, world_model.percept_names)
         kept = clip.valid.flatten()
-        z = policy.world_model.encode(clip)
+        z = world_model.encode(clip)
         filtered.append(select({k: v.flatten(0, 1) for k, v in z.items()}, kept))
         percepts = {k: v.flatten(0, 1)[kept] for k, v in clip.percepts.items()}
-        before = policy.first_action(clip.action.flatten(0, 1)[kept])
-        single.append(policy.world_model.observe(None, before, percepts, clip.state.flatten(0, 1)[kept]))
+        before = units.first_action(clip.action.flatten(0, 1)[kept])
+        single.append(world_model.observe(None, before, percepts, clip.state.flatten(0, 1)[kept]))
     pool: Latent = {
         k: torch.cat([gathered(torch.cat([z[k] for z in part])) for part in (single, filtered)]) for k in single[0]
     }
     size = len(next(iter(pool.values())))
 
     def draw(count: int) -> Latent:
-        picked = share(torch.randint(size, (count,), generator=generator)).to(policy.device)
+        picked = share(torch.randint(size, (count,), generator=generator)).to(model.device)
         return map_latent(pool, lambda t: t[picked])
 
     return draw
 
 
-def covered_actions(policy: LatentSafePolicy, reader: ClipReader, coverage: float) -> tuple[list[float], list[float]]:
+def covered_actions(model: SafetyModel, reader: ClipReader, coverage: float) -> tuple[list[float], list[float]]:
     """Range of each command, in [-1, 1], that holds all but a share `coverage` of the data at either end, and zero."""
-    action = policy.normalise_action(torch.from_numpy(np.array(reader.cache.action)).to(policy.device))
+    action = model.units.normalise_action(torch.from_numpy(np.array(reader.cache.action)).to(model.device))
     ends = torch.tensor([coverage, 1 - coverage], device=action.device)
     low, high = torch.quantile(
         action[torch.linspace(0, len(action) - 1, min(len(action), 100_000)).long()], ends, dim=0
@@ -188,65 +199,40 @@ def train_reachability(
         UntrainedFilterError: the world model was never trained.
         FileExistsError: output_dir holds a checkpoint already.
     """
-    from tqdm import trange
-
-    refuse_existing(output_dir)
+    refuse_existing(Path(output_dir) / CONFIG)
     policy, reader = load_with_cache(path, dataset_meta, seed)
-    if policy.device.type == "cpu":
+    model, started = policy.model, time.process_time()
+    if model.device.type == "cpu":
         keep_freed_memory()
-    config = policy.config.reachability
-    policy.config.target = policy.config.law = target
-    if target == "risk":
-        policy.config.lookahead = 0
-    policy.config.require_critic_of_law()
-    if steps is not None:
-        config.steps = steps
     generator = torch.Generator(device="cpu").manual_seed(seed)
-    if not policy.critic.discrete:
-        policy.config.fallback_low, policy.config.fallback_high = covered_actions(policy, reader, config.coverage)
-    policy.world_model.requires_grad_(False)
-    policy.margin.requires_grad_(False)
-    policy.critic = policy.new_critic(policy.critic.candidates)
-    started = time.process_time()
-    starts = encoded_starts(policy, reader, generator)
-    learner = LatentReachability(policy.imagination, policy.critic, starts, config)
-    progress = trange(config.steps, desc="reachability", unit="step", disable=rank() > 0)
+    _aim_at(model, reader, target, steps)
+    model.world_model.requires_grad_(False)
+    model.margin.requires_grad_(False)
+    starts = encoded_starts(model, reader, generator)
+    learner = LatentReachability(model.imagination, model.critic, starts, model.config.reachability)
+    progress = trange(model.config.reachability.steps, desc="reachability", unit="step", disable=rank() > 0)
     for step in progress:
         metrics = learner.update()
         if step % 200 == 0:
             progress.set_postfix(loss=f"{metrics['critic_loss']:.1e}", gamma=f"{metrics['gamma']:.4f}")
-    policy.config.stage = "reachability"
-    policy.critic.eval()
-    policy.config.frame_cache = None
+    policy.config.change(trained_on=replace(policy.config.trained_on, stage="critic"))
+    model.critic.eval()
     if rank() == 0:
-        save_filter(policy, output_dir)
+        save_policy(policy, output_dir)
         print(f"reachability: {time.process_time() - started:.0f} CPU-s")
     return policy
 
 
-def refuse_existing(output_dir: str | Path) -> None:
-    """Raise FileExistsError if a checkpoint would be overwritten; called before any work is done."""
-    if (Path(output_dir) / "config.json").exists():
-        raise FileExistsError(f"{output_dir} holds a checkpoint already; choose another --output_dir")
-
-
-def save_filter(policy: PreTrainedPolicy, output_dir: Path, half: bool = False) -> None:
-    """Write a filter, or a task policy, with the processors LeRobot's commands expect; `half` stores 16-bit weights."""
-    from lerobot.policies.factory import make_pre_post_processors
-
-    policy.save_pretrained(output_dir)
-    if half:
-        halve_weights(output_dir)
-    for pipeline in make_pre_post_processors(policy.config):
-        pipeline.save_pretrained(output_dir)
-
-
-def halve_weights(folder: Path) -> None:
-    """Rewrite every model.safetensors below a folder in 16 bits, and seal those of filters again."""
-    from safetensors.torch import load_file, save_file
-
-    for file in Path(folder).rglob(WEIGHTS):
-        tensors = {k: v.half() if v.is_floating_point() else v for k, v in load_file(file).items()}
-        save_file(tensors, file, metadata={"format": "pt"})
-        if (file.parent / INTEGRITY).exists():
-            seal(file.parent)
+def _aim_at(model: SafetyModel, reader: ClipReader, target: str, steps: int | None) -> None:
+    """Give a model a fresh critic for this target, and a configuration that says so."""
+    config = model.config
+    law = replace(config.law, name=target, lookahead=0 if target == "risk" else config.law.lookahead)
+    reachability, fallback = config.reachability, config.fallback
+    if steps is not None:
+        reachability = replace(reachability, steps=steps)
+    if not model.critic.discrete:
+        low, high = covered_actions(model, reader, reachability.coverage)
+        fallback = replace(fallback, low=low, high=high)
+    trained_on = replace(config.trained_on, stage="world_model", target=target)
+    config.change(trained_on=trained_on, law=law, reachability=reachability, fallback=fallback, frame_cache=None)
+    model.critic = model.new_critic()

@@ -19,12 +19,13 @@ import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from torch import Tensor
 
+from lerobot_latentsafe.critic import SafetyCritic
 from lerobot_latentsafe.datasets.clips import ClipReader
-from lerobot_latentsafe.evaluation.rollouts import provenance, write_json
+from lerobot_latentsafe.evaluation.statistics import provenance, write_json
+from lerobot_latentsafe.latent import Latent, map_latent
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
-from lerobot_latentsafe.reachability import LatentReachability, SafetyCritic, look_ahead
+from lerobot_latentsafe.reachability import LatentReachability, look_ahead
 from lerobot_latentsafe.training import covered_actions, encoded_starts, load_with_cache
-from lerobot_latentsafe.world_models.base import Latent, map_latent
 
 VARIANTS = {
     "as configured": {},

@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from lerobot_latentsafe.envs.bag import BagScene
-from lerobot_latentsafe.evaluation.bag import (
+from lerobot_latentsafe.evaluation.statistics import write_json
+from lerobot_latentsafe.experiments.bag.runs import (
     FIRST_SEED,
     FilterSetting,
     add_filter_options,
@@ -30,10 +30,10 @@ from lerobot_latentsafe.evaluation.bag import (
     tabulate,
     traces,
 )
-from lerobot_latentsafe.evaluation.figures import save, value_profiles
-from lerobot_latentsafe.evaluation.rollouts import write_json
+from lerobot_latentsafe.franka.bag import BagScene
+from lerobot_latentsafe.franka.behaviors import begin
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
-from lerobot_latentsafe.teleoperators.scripted.behaviors import begin
+from lerobot_latentsafe.reports.figures import save, value_profiles
 
 OPERATORS = {
     "closed_end": ("closed_end", None),

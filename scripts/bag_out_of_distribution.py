@@ -18,8 +18,8 @@ import numpy as np
 import torch
 
 from lerobot_latentsafe.configuration_latentsafe import LAWS
-from lerobot_latentsafe.envs.bag import VARIANTS, BagScene
-from lerobot_latentsafe.evaluation.bag import (
+from lerobot_latentsafe.evaluation.statistics import write_json
+from lerobot_latentsafe.experiments.bag.runs import (
     FilterSetting,
     add_filter_options,
     against_bare,
@@ -31,10 +31,10 @@ from lerobot_latentsafe.evaluation.bag import (
     summary,
     traces,
 )
-from lerobot_latentsafe.evaluation.figures import save, value_profiles
-from lerobot_latentsafe.evaluation.rollouts import write_json
+from lerobot_latentsafe.franka.bag import VARIANTS, BagScene
+from lerobot_latentsafe.franka.behaviors import Actions, begin
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
-from lerobot_latentsafe.teleoperators.scripted.behaviors import Actions, begin
+from lerobot_latentsafe.reports.figures import save, value_profiles
 
 SEEN = "red"
 UNSEEN = [name for name in VARIANTS if name not in (SEEN, "sealed")]

@@ -16,8 +16,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from lerobot_latentsafe.envs.bag import BagScene
-from lerobot_latentsafe.evaluation.bag import (
+from lerobot_latentsafe.base_policy import BasePolicy
+from lerobot_latentsafe.evaluation.statistics import write_json
+from lerobot_latentsafe.experiments.bag.runs import (
     FIRST_SEED,
     FilterSetting,
     add_filter_options,
@@ -30,10 +31,9 @@ from lerobot_latentsafe.evaluation.bag import (
     run_cells,
     tabulate,
 )
-from lerobot_latentsafe.evaluation.figures import save, severity, write_side_by_side
-from lerobot_latentsafe.evaluation.rollouts import write_json
+from lerobot_latentsafe.franka.bag import BagScene
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
-from lerobot_latentsafe.shield import BasePolicy
+from lerobot_latentsafe.reports.figures import save, severity, write_side_by_side
 
 STEPS = 150
 """Policies take their time: one that learned to correct itself grasps after 4 to 9 s."""

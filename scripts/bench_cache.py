@@ -42,8 +42,8 @@ from lerobot_latentsafe.datasets.frame_cache import (
     scale_file,
     to_model_images,
 )
-from lerobot_latentsafe.evaluation.rollouts import provenance, write_json
-from lerobot_latentsafe.memory import keep_freed_memory
+from lerobot_latentsafe.evaluation.statistics import provenance, write_json
+from lerobot_latentsafe.runtime.malloc import keep_freed_memory
 
 COPIES = 10
 TRAIN = (

@@ -40,10 +40,11 @@ import torch
 import yaml
 from torch import Tensor, nn
 
-from lerobot_latentsafe.evaluation.rollouts import provenance, write_json
-from lerobot_latentsafe.memory import keep_freed_memory
-from lerobot_latentsafe.world_models import Clip, DinoWM, DinoWMConfig, WorldModelConfig
-from lerobot_latentsafe.world_models.base import select
+from lerobot_latentsafe.datasets.clips import Clip
+from lerobot_latentsafe.evaluation.statistics import provenance, write_json
+from lerobot_latentsafe.latent import select
+from lerobot_latentsafe.runtime.malloc import keep_freed_memory
+from lerobot_latentsafe.world_models import DinoWM, DinoWMConfig, WorldModelConfig
 from lerobot_latentsafe.world_models.frame_transformer import FrameTransformer
 
 PAPER = Path(__file__).parents[1] / "configs" / "bag_dino_wm_paper.yaml"

@@ -36,7 +36,7 @@ from bench_rssm import authors_config, authors_frames, authors_modules, fresh_po
 from gymnasium.wrappers import TimeLimit
 
 from lerobot_latentsafe.datasets.clips import ClipReader
-from lerobot_latentsafe.evaluation.rollouts import provenance, write_json
+from lerobot_latentsafe.evaluation.statistics import provenance, write_json
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.reachability import LatentReachability
 from lerobot_latentsafe.training import encoded_starts

@@ -285,8 +285,8 @@ def serve_once(root: Path, sender) -> None:
     """The server of `latentsafe label` in a process that will be killed; sends its address."""
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
+    from lerobot_latentsafe.datasets.episodes import DatasetFrames
     from lerobot_latentsafe.labeling.app import LabelServer, listen, serve
-    from lerobot_latentsafe.labeling.frames import DatasetFrames
     from lerobot_latentsafe.labeling.store import LabelStore
 
     frames = DatasetFrames(LeRobotDatasetMetadata("bench/cup", root=root))
@@ -321,7 +321,7 @@ def main() -> None:
         first = film(arguments.root, arguments.n_episodes)
         (arguments.root / "truth.json").write_text(json.dumps(first))
         return
-    from lerobot_latentsafe.evaluation.rollouts import provenance, write_json
+    from lerobot_latentsafe.evaluation.statistics import provenance, write_json
 
     with tempfile.TemporaryDirectory() as folder:  # labels go to a copy that shares the videos
         copy = Path(folder) / "filmed"

@@ -30,10 +30,10 @@ import torch.multiprocessing as mp
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from torch.nn.parallel import DistributedDataParallel
 
-from lerobot_latentsafe import ranks
-from lerobot_latentsafe.evaluation.rollouts import provenance, write_json
-from lerobot_latentsafe.memory import keep_freed_memory
+from lerobot_latentsafe.evaluation.statistics import provenance, write_json
 from lerobot_latentsafe.reachability import LatentReachability
+from lerobot_latentsafe.runtime import distributed
+from lerobot_latentsafe.runtime.malloc import keep_freed_memory
 from lerobot_latentsafe.training import encoded_starts, load_with_cache
 
 TASKS = ("world_model", "reachability", "reachability_2048")
@@ -45,7 +45,7 @@ def training_steps(args: argparse.Namespace) -> Callable[[], int]:
     """Some gradient steps of the world model; returns the clips that all ranks learned from."""
     policy, policy.reader = load_with_cache(args.policy, metadata(args))
     policy.train()
-    distributed = ranks.world_size() > 1
+    distributed = distributed.world_size() > 1
     model = DistributedDataParallel(policy, find_unused_parameters=True) if distributed else policy
     optimizer = torch.optim.Adam(policy.get_optim_params(), 1e-4, fused=True)
     n = len(policy.reader.labels.failure)
@@ -57,7 +57,7 @@ def training_steps(args: argparse.Namespace) -> Callable[[], int]:
             loss.backward()
             torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
             optimizer.step()
-        return args.steps * args.batch * ranks.world_size()
+        return args.steps * args.batch * distributed.world_size()
 
     return work
 
@@ -70,8 +70,8 @@ def reachability_steps(args: argparse.Namespace, batch_size: int | None = None) 
     """
     policy, reader = load_with_cache(args.policy, metadata(args))
     config = policy.config.reachability
-    config.batch_size = (batch_size or config.batch_size) * ranks.world_size()
-    config.pool = config.kept * 1024 * ranks.world_size()  # a chunk of 1024 starts a rank
+    config.batch_size = (batch_size or config.batch_size) * distributed.world_size()
+    config.pool = config.kept * 1024 * distributed.world_size()  # a chunk of 1024 starts a rank
     generator = torch.Generator().manual_seed(0)
     starts = encoded_starts(policy, reader, generator, max_frames=5000)
     learner = LatentReachability(policy.imagination, policy.critic, starts, config, generator)

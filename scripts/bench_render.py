@@ -26,8 +26,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from PIL import Image
 
-from lerobot_latentsafe.envs import dubins
-from lerobot_latentsafe.evaluation.rollouts import provenance, write_json
+from lerobot_latentsafe.dubins import car
+from lerobot_latentsafe.evaluation.statistics import provenance, write_json
 
 SIZE = 128
 
@@ -36,10 +36,10 @@ def draw_with_matplotlib(state: np.ndarray) -> np.ndarray:
     """One frame (SIZE, SIZE, 3) uint8 of a state (3,)."""
     x, y, heading = state
     fig = plt.figure(figsize=(1, 1), dpi=SIZE)
-    ax = fig.add_axes((0, 0, 1, 1), xlim=(-dubins.VIEW, dubins.VIEW), ylim=(-dubins.VIEW, dubins.VIEW))
+    ax = fig.add_axes((0, 0, 1, 1), xlim=(-car.VIEW, car.VIEW), ylim=(-car.VIEW, car.VIEW))
     ax.set_axis_off()
-    ax.add_patch(plt.Circle((0, 0), dubins.RADIUS, fill=False, color="red"))
-    length = dubins.Renderer.arrow_length
+    ax.add_patch(plt.Circle((0, 0), car.RADIUS, fill=False, color="red"))
+    length = car.Renderer.arrow_length
     ax.quiver(
         [x], [y], [length * np.cos(heading)], [length * np.sin(heading)],
         angles="xy", scale_units="xy", scale=1, width=0.04, color="blue",
@@ -73,7 +73,7 @@ def main() -> None:
     parser.add_argument("--picture", type=Path, help="where to write one frame of each side by side, .png")
     args = parser.parse_args()
     states = np.random.default_rng(args.seed).uniform([-1, -1, -np.pi], [1, 1, np.pi], (args.frames, 3))
-    renderer = dubins.Renderer(SIZE)
+    renderer = car.Renderer(SIZE)
 
     rounds = {
         "matplotlib": (args.figures, lambda: [draw_with_matplotlib(s) for s in states[: args.figures]]),

@@ -40,12 +40,12 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.factory import make_policy
 
+from lerobot_latentsafe.collection.dubins import collect_dubins
 from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
 from lerobot_latentsafe.datasets.build_cache import build_frame_cache
 from lerobot_latentsafe.datasets.clips import ClipReader
-from lerobot_latentsafe.datasets.collect import collect_dubins
 from lerobot_latentsafe.datasets.labels import FailureLabels
-from lerobot_latentsafe.evaluation.rollouts import provenance, write_json
+from lerobot_latentsafe.evaluation.statistics import provenance, write_json
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 
 CAMERA = "observation.image"

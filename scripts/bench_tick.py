@@ -16,9 +16,9 @@ import numpy as np
 import torch
 from tqdm import trange
 
-from lerobot_latentsafe.envs.bag import BagScene
-from lerobot_latentsafe.evaluation.bag import FIRST_SEED, WARM_UP, observe
-from lerobot_latentsafe.evaluation.rollouts import provenance, write_json
+from lerobot_latentsafe.evaluation.statistics import provenance, write_json
+from lerobot_latentsafe.experiments.bag.runs import FIRST_SEED, WARM_UP, observe
+from lerobot_latentsafe.franka.bag import BagScene
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 
 DENOISING_STEPS = 10

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from lerobot_latentsafe.envs.scenes import SCENES
-from lerobot_latentsafe.evaluation.bag import fingerprint
-from lerobot_latentsafe.evaluation.blocks_study import (
+from lerobot_latentsafe.evaluation.statistics import paired_p_value, provenance, run_resumable, wilson, write_json
+from lerobot_latentsafe.experiments.bag.runs import fingerprint
+from lerobot_latentsafe.experiments.blocks.study import (
     lead,
     leads,
     run,
@@ -24,8 +24,8 @@ from lerobot_latentsafe.evaluation.blocks_study import (
     unsafe_rollout,
     world_model_of,
 )
-from lerobot_latentsafe.evaluation.figures import save
-from lerobot_latentsafe.evaluation.rollouts import paired_p_value, provenance, run_resumable, wilson, write_json
+from lerobot_latentsafe.franka.scenes import SCENES
+from lerobot_latentsafe.reports.figures import save
 
 FIRST_SEED = 400_000
 """Of the table's starts; training and choices use smaller ones."""

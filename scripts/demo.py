@@ -11,7 +11,7 @@ import shutil
 import threading
 from pathlib import Path
 
-from lerobot_latentsafe.evaluation.demo import Demo
+from lerobot_latentsafe.experiments.demo import Demo
 
 CANDIDATES = "[[-1.25,1.0],[0.0,1.0],[1.25,1.0]]"
 
@@ -111,14 +111,14 @@ def save_every_seventh_state(file: Path) -> None:
     """A part of the paper's grid: enough for a demonstration's three digits."""
     import numpy as np
 
-    from lerobot_latentsafe.evaluation.ground_truth import grid_states
+    from lerobot_latentsafe.dubins.ground_truth import grid_states
 
     np.save(file, grid_states()[::7])
 
 
 def report(out: Path, seconds: float) -> None:
     """Print the table; write metrics.json and report.html."""
-    from lerobot_latentsafe.evaluation import report as html
+    from lerobot_latentsafe.reports import html as html
 
     shield, monitor = (json.loads((out / f"{name}.json").read_text()) for name in ("shield", "monitor"))
     videos = sorted(out.glob("videos/*.mp4"))

@@ -11,8 +11,8 @@ import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from lerobot_latentsafe.evaluation import report as html
-from lerobot_latentsafe.evaluation.demo import Demo
+from lerobot_latentsafe.experiments.demo import Demo
+from lerobot_latentsafe.reports import html as html
 
 OPERATORS = {"closed_end": "pulls the closed end up", "open_end": "lifts the open end"}
 
@@ -117,7 +117,7 @@ def report(out: Path, law: str, seconds: float) -> None:
 
 
 def main() -> None:
-    from lerobot_latentsafe.checkpoint import read_config, resolve_checkpoint
+    from lerobot_latentsafe.runtime.checkpoint import read_config, resolve_checkpoint
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("outputs/demo_bag"))

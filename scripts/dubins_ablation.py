@@ -13,12 +13,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from lerobot_latentsafe.envs.dubins import TURN_RATES
-from lerobot_latentsafe.evaluation.figures import save, value_slices
-from lerobot_latentsafe.evaluation.ground_truth import exact_value, grid_states
-from lerobot_latentsafe.evaluation.monitor import LatentMonitor
-from lerobot_latentsafe.evaluation.rollouts import confusion, provenance, wilson, write_json
+from lerobot_latentsafe.dubins.car import TURN_RATES
+from lerobot_latentsafe.dubins.ground_truth import exact_value, grid_states
+from lerobot_latentsafe.evaluation.statistics import confusion, provenance, wilson, write_json
+from lerobot_latentsafe.experiments.dubins.figures import value_slices
+from lerobot_latentsafe.experiments.dubins.monitor import LatentMonitor
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+from lerobot_latentsafe.reports.figures import save
 
 
 def main() -> None:

@@ -15,10 +15,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from lerobot_latentsafe.baselines.privileged import train_privileged
-from lerobot_latentsafe.evaluation.figures import save, value_slices
-from lerobot_latentsafe.evaluation.ground_truth import exact_value, grid_states, solve_continuous
-from lerobot_latentsafe.evaluation.monitor import (
+from lerobot_latentsafe.critic import ReachabilityConfig
+from lerobot_latentsafe.dubins.ground_truth import exact_value, grid_states, solve_continuous
+from lerobot_latentsafe.evaluation.statistics import confusion, provenance, wilson, write_json
+from lerobot_latentsafe.experiments.dubins.figures import value_slices
+from lerobot_latentsafe.experiments.dubins.monitor import (
     LatentMonitor,
     PlanMonitor,
     PrivilegedMonitor,
@@ -26,9 +27,9 @@ from lerobot_latentsafe.evaluation.monitor import (
     feasible_starts,
     safe_policy_rollouts,
 )
-from lerobot_latentsafe.evaluation.rollouts import confusion, provenance, wilson, write_json
+from lerobot_latentsafe.experiments.dubins.privileged import train_privileged
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
-from lerobot_latentsafe.reachability import ReachabilityConfig
+from lerobot_latentsafe.reports.figures import save
 
 
 def score(value: np.ndarray, truths: dict[str, np.ndarray]) -> dict:

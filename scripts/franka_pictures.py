@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from lerobot_latentsafe.envs.scenes import make_scene
-from lerobot_latentsafe.teleoperators.scripted.behaviors import begin
+from lerobot_latentsafe.franka.behaviors import begin
+from lerobot_latentsafe.franka.scenes import make_scene
 
 OUT = Path("results/franka")
 SHEETS = {

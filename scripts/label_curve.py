@@ -26,12 +26,12 @@ import numpy as np
 import torch
 
 from lerobot_latentsafe.datasets.clips import ClipReader
-from lerobot_latentsafe.evaluation.figures import save
-from lerobot_latentsafe.evaluation.rollouts import provenance, write_json
+from lerobot_latentsafe.evaluation.statistics import provenance, write_json
 from lerobot_latentsafe.evaluation.world_model import balanced_accuracy
 from lerobot_latentsafe.labeling.suggestions import Suggestion
 from lerobot_latentsafe.margin import FailureMargin
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+from lerobot_latentsafe.reports.figures import save
 from lerobot_latentsafe.training import fit_margin, load_with_cache, seen_and_imagined
 
 SHARES = (0.02, 0.05, 0.1, 0.2, 1.0)

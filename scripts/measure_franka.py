@@ -20,13 +20,13 @@ from pathlib import Path
 
 import numpy as np
 
-from lerobot_latentsafe.envs import bag
-from lerobot_latentsafe.envs.bag import BagScene
-from lerobot_latentsafe.envs.blocks import BlocksScene
-from lerobot_latentsafe.envs.franka import FrankaScene
-from lerobot_latentsafe.evaluation.rollouts import provenance, wilson, write_json
-from lerobot_latentsafe.robots.franka_interface import MAX_SPEED
-from lerobot_latentsafe.teleoperators.scripted.behaviors import begin, grasp
+from lerobot_latentsafe.evaluation.statistics import provenance, wilson, write_json
+from lerobot_latentsafe.franka import bag
+from lerobot_latentsafe.franka.actions import MAX_SPEED
+from lerobot_latentsafe.franka.bag import BagScene
+from lerobot_latentsafe.franka.behaviors import begin, grasp
+from lerobot_latentsafe.franka.blocks import BlocksScene
+from lerobot_latentsafe.franka.scene import FrankaScene
 
 OUT = Path("results/franka")
 FIRST_SEED = 100_000
@@ -224,7 +224,7 @@ def recording(n: int) -> dict:
     """All threads' CPU time, after one recording to warm up; label balance of what was recorded."""
     import tempfile
 
-    from lerobot_latentsafe.datasets.collect_franka import collect_franka
+    from lerobot_latentsafe.collection.franka import collect_franka
     from lerobot_latentsafe.datasets.labels import FailureLabels
 
     row = {}
@@ -251,7 +251,7 @@ def balance(n: int) -> dict:
     """What each dataset recorded by scripts/collect_franka.sh holds; its first n episodes at most."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    from lerobot_latentsafe.datasets.collect_franka import SOURCES
+    from lerobot_latentsafe.collection.franka import SOURCES
     from lerobot_latentsafe.datasets.labels import FAILING
 
     rows = {}

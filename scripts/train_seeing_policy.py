@@ -30,8 +30,8 @@ from tqdm import trange
 
 from lerobot_latentsafe.datasets.frame_cache import FOLDER, MANIFEST, FrameCache
 from lerobot_latentsafe.datasets.windows import Windows
-from lerobot_latentsafe.perceive import AIM, SWITCH, check_seen, let_see, switched, with_aim
-from lerobot_latentsafe.training import halve_weights
+from lerobot_latentsafe.policies.grasp_prediction import AIM, SWITCH, check_seen, let_see, switched, with_aim
+from lerobot_latentsafe.runtime.checkpoint import halve_weights
 
 OPEN_FINGERS = 3
 """How much likelier a frame before the fingers close is drawn: what is hard is to get there."""

@@ -30,7 +30,7 @@ def seeded():
 @pytest.fixture(scope="session")
 def dataset_root(tmp_path_factory):
     """14 random episodes of the car, with failing and safe frames."""
-    from lerobot_latentsafe.datasets.collect import collect_dubins
+    from lerobot_latentsafe.collection.dubins import collect_dubins
 
     root = tmp_path_factory.mktemp("data") / "car"
     collect_dubins("random", tiny.REPO_ID, root, n_episodes=14, seed=3)
@@ -107,7 +107,7 @@ def tiny_diffusion(tmp_path_factory):
 @pytest.fixture(scope="session")
 def tiny_dreamer(tmp_path_factory):
     """Output folder of a run of train-dreamer that was never interrupted."""
-    from lerobot_latentsafe.baselines.dreamer.training import DreamerTraining
+    from lerobot_latentsafe.experiments.blocks.dreamer_training import DreamerTraining
 
     folder = tmp_path_factory.mktemp("dreamer") / "run"
     with tiny.short_blocks():

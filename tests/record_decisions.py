@@ -9,8 +9,8 @@ from lerobot.envs import make_env, preprocess_observation
 from test_decisions import FILE, FILTERS, VARIANTS, decide_all
 
 from lerobot_latentsafe import LatentSafeBagEnv, LatentSafeBlocksEnv, LatentSafeDubinsEnv
+from lerobot_latentsafe.base_policy import BasePolicy
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
-from lerobot_latentsafe.shield import BasePolicy
 
 ENVS = {"dubins": LatentSafeDubinsEnv, "bag": LatentSafeBagEnv, "blocks": LatentSafeBlocksEnv}
 POLICIES = {"dubins": "dubins_diffusion_reckless", "bag": "bag_diffusion_weak", "blocks": "blocks_dreamer"}

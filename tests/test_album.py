@@ -5,8 +5,8 @@ import pytest
 import tiny
 import torch
 
-from lerobot_latentsafe.evaluation.album import Album
-from lerobot_latentsafe.labeling.frames import DatasetFrames
+from lerobot_latentsafe.datasets.episodes import DatasetFrames
+from lerobot_latentsafe.evaluation.nearest_frames import Album
 
 CAMERA = "observation.image"
 
@@ -32,8 +32,8 @@ def test_the_frame_nearest_to_what_was_seen_is_that_frame(policy, dataset_meta):
 
 
 def test_large_datasets_are_sampled(policy, dataset_meta, monkeypatch):
-    monkeypatch.setattr("lerobot_latentsafe.evaluation.album.EPISODES", 3)
-    monkeypatch.setattr("lerobot_latentsafe.evaluation.album.FRAMES", 30)
+    monkeypatch.setattr("lerobot_latentsafe.evaluation.nearest_frames.EPISODES", 3)
+    monkeypatch.setattr("lerobot_latentsafe.evaluation.nearest_frames.FRAMES", 30)
     album = Album(policy)
     album.add_dataset(DatasetFrames(dataset_meta))
     assert 3 <= len(album) <= 60

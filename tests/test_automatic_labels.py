@@ -9,8 +9,9 @@ import pytest
 import tiny
 
 from lerobot_latentsafe.cli import main
+from lerobot_latentsafe.datasets.episodes import DatasetFrames
 from lerobot_latentsafe.datasets.labels import FailureLabels
-from lerobot_latentsafe.envs import dubins
+from lerobot_latentsafe.dubins import car
 from lerobot_latentsafe.labeling.automatic import (
     AnswerError,
     ChatEndpoint,
@@ -21,14 +22,13 @@ from lerobot_latentsafe.labeling.automatic import (
     label_automatically,
     parse_answer,
 )
-from lerobot_latentsafe.labeling.frames import DatasetFrames
 from lerobot_latentsafe.labeling.store import LabelStore
 
 
 @pytest.fixture(scope="module")
 def reckless(tmp_path_factory):
     """Episodes that enter the disc, with the recorded position."""
-    from lerobot_latentsafe.datasets.collect import collect_dubins
+    from lerobot_latentsafe.collection.dubins import collect_dubins
 
     root = tmp_path_factory.mktemp("reckless") / "car"
     collect_dubins("reckless", tiny.REPO_ID, root, n_episodes=4, seed=0)
@@ -76,7 +76,7 @@ def test_simulation_truth_equals_the_recorded_labels(root, capsys):
     main(["auto-label", "--labeller=dubins_truth", f"--dataset.repo_id={tiny.REPO_ID}", f"--dataset.root={root}",
           "--specification=entered"])  # fmt: skip
     assert "labelled   4 episodes" in capsys.readouterr().out
-    assert np.array_equal(FailureLabels.load(root, "entered").failure, column) and dubins.RADIUS == 0.5
+    assert np.array_equal(FailureLabels.load(root, "entered").failure, column) and car.RADIUS == 0.5
 
 
 def test_labels_of_people_stay(labelled):

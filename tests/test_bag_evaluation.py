@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import tiny
 
-from lerobot_latentsafe.evaluation import bag, figures
-from lerobot_latentsafe.teleoperators.scripted.behaviors import hold
+from lerobot_latentsafe.experiments.bag import runs
+from lerobot_latentsafe.franka.behaviors import hold
+from lerobot_latentsafe.reports import figures
 
 
 def row(lost, first=None, success=False, steps=90):
@@ -23,7 +24,7 @@ def row(lost, first=None, success=False, steps=90):
 
 
 def test_summary_counts_what_is_lost_and_overridden():
-    cell = bag.summary([row(0, success=True), row(1, first=80), row(12, first=60)], n_candies=24)
+    cell = runs.summary([row(0, success=True), row(1, first=80), row(12, first=60)], n_candies=24)
     assert cell["spilled"]["k"] == 2 and cell["spilled_5_percent"]["k"] == 1 and cell["success"]["k"] == 1
     assert (cell["spills_below_5_percent"]["k"], cell["spills_below_5_percent"]["n"]) == (1, 2)
     assert cell["mean_share_lost"] == pytest.approx(13 / 72) and cell["overridden_share"] == pytest.approx(40 / 270)
@@ -33,21 +34,21 @@ def test_summary_counts_what_is_lost_and_overridden():
 
 def test_summary_counts_spills_that_the_margin_does_not_see():
     late = {"spilled": [0, 1, 2, 2], "margin": [-0.5, 0.5, 0.5, -0.5]}
-    cell = bag.summary([row(2) | late, row(0)], n_candies=24)
+    cell = runs.summary([row(2) | late, row(0)], n_candies=24)
     assert cell["seen_after_a_spill"] == {"n": 2, "called_safe": 1}
 
 
 def test_summary_of_an_operator_alone_says_nothing_of_a_filter():
     bare = row(0) | {"value": [], "intervened": [], "cost": []}
-    cell = bag.summary([bare], n_candies=24)
+    cell = runs.summary([bare], n_candies=24)
     assert "overridden_share" not in cell and "decision_cpu_ms" not in cell and cell["spills_below_5_percent"] is None
-    assert bag.in_short(cell) == "spilled 0/1, success 0/1, share lost 0.000"
+    assert runs.in_short(cell) == "spilled 0/1, success 0/1, share lost 0.000"
 
 
 def test_filters_are_compared_with_the_bare_runs_each_and_together():
     bare = [row(20), row(20), row(0, success=True), row(20)]
     shielded = {"first": [row(0), row(1), row(0), row(0)], "second": [row(0), row(0), row(0, success=True), row(0)]}
-    table = bag.against_bare(bare, shielded, n_candies=24)
+    table = runs.against_bare(bare, shielded, n_candies=24)
     assert [table[name]["spilled_of_bare"] for name in ("first", "second", "pooled")] == pytest.approx(
         [1 / 3, 0, 1 / 6]
     )
@@ -59,15 +60,15 @@ def test_filters_are_compared_with_the_bare_runs_each_and_together():
 def test_figures_are_drawn(tmp_path):
     lost = {"weak": [20, 24, 0], "weak, shielded": [0, 1, 0], "strong": [0, 0, 1], "strong, shielded": [0, 0, 0]}
     figures.save(figures.severity(lost, 24), tmp_path / "severity.png")
-    panels = {"closed end": bag.traces([row(3, first=40)] * 9), "open end": bag.traces([row(0)])}
-    assert len(panels["closed end"]) == bag.N_TRACES
+    panels = {"closed end": runs.traces([row(3, first=40)] * 9), "open end": runs.traces([row(0)])}
+    assert len(panels["closed end"]) == runs.N_TRACES
     figures.save(figures.value_profiles(panels, 0.3, 15), tmp_path / "profiles.png")
     assert all((tmp_path / f"{name}.png").stat().st_size > 5000 for name in ("severity", "profiles"))
 
 
 @pytest.fixture(scope="module")
 def scene():
-    from lerobot_latentsafe.envs.bag import BagScene
+    from lerobot_latentsafe.franka.bag import BagScene
 
     made = BagScene(image_size=32)
     yield made
@@ -77,7 +78,7 @@ def scene():
 @pytest.fixture(scope="module")
 def setting(tmp_path_factory):
     folder = tiny.save_franka_filter(tmp_path_factory.mktemp("bag") / "filter", scene="bag", epsilon=0.25)
-    return bag.FilterSetting.of(str(folder), "plan", guard=2)
+    return runs.FilterSetting.of(str(folder), "plan", guard=2)
 
 
 def test_a_setting_is_the_filters_own_unless_given(setting):
@@ -87,21 +88,21 @@ def test_a_setting_is_the_filters_own_unless_given(setting):
 
 
 def test_a_table_notes_how_its_filters_remember_and_retreat(setting, tmp_path):
-    assert bag.in_use([setting]) == {setting.path: {"epsilon": 0.25, "guard": 2, "release": -1.0}}
+    assert runs.in_use([setting]) == {setting.path: {"epsilon": 0.25, "guard": 2, "release": -1.0}}
     ways = {"memory": 24, "retreat": {"delta_z.pos": -0.006}, "patience": 1, "dwell": 6}
-    other = bag.FilterSetting.of(str(tiny.save_franka_filter(tmp_path / "filter", scene="bag", **ways)), "margin")
-    assert bag.in_use([other])[other.path].items() >= ways.items()
+    other = runs.FilterSetting.of(str(tiny.save_franka_filter(tmp_path / "filter", scene="bag", **ways)), "margin")
+    assert runs.in_use([other])[other.path].items() >= ways.items()
 
 
 def test_an_overridden_operator_goes_on_trying(scene, setting, monkeypatch):
-    monkeypatch.setattr(bag, "STEPS", 4)
-    always = bag.FilterSetting.of(setting.path, "margin", epsilon=2.0)
+    monkeypatch.setattr(runs, "STEPS", 4)
+    always = runs.FilterSetting.of(setting.path, "margin", epsilon=2.0)
     frames = []
     scene.reset(0)
-    ended = bag.drive(scene, always.load(), hold(1.0, 2), frames)
+    ended = runs.drive(scene, always.load(), hold(1.0, 2), frames)
     assert ended["intervened"] == [True] * 4 and ended["overridden"] == 4 and ended["first"] == 0
     assert len(frames) == len(ended["cost"]) == len(ended["value"]) == 4 and frames[0].shape == (32, 32, 3)
     assert ended["lost"] == 0 and not ended["success"] and not ended["grasped"]
     scene.reset(0)
-    alone = bag.drive(scene, None, hold(1.0, 2))
+    alone = runs.drive(scene, None, hold(1.0, 2))
     assert alone["value"] == [] and alone["first"] is None and np.isfinite(alone["spilled"]).all()

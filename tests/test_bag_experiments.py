@@ -10,13 +10,13 @@ import pytest
 import tiny
 import torch
 
-from lerobot_latentsafe.envs.bag import BagScene
-from lerobot_latentsafe.evaluation import bag
-from lerobot_latentsafe.evaluation.demo import Demo
-from lerobot_latentsafe.evaluation.report import PRINTED
-from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, STATE_NAMES, action_limits
+from lerobot_latentsafe.experiments.bag import runs
+from lerobot_latentsafe.experiments.demo import Demo
+from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES, action_limits
+from lerobot_latentsafe.franka.bag import BagScene
+from lerobot_latentsafe.reports.html import PRINTED
 
-STEPS, SEEDS = 4, [bag.FIRST_SEED, bag.FIRST_SEED + 1]
+STEPS, SEEDS = 4, [runs.FIRST_SEED, runs.FIRST_SEED + 1]
 
 
 @pytest.fixture(scope="module")
@@ -49,14 +49,14 @@ def base_path(tmp_path_factory):
 @pytest.fixture
 def script(monkeypatch):
     """A script as a module, on small pictures and for a few steps; `options` are its command line."""
-    observe = bag.observe
+    observe = runs.observe
 
     def observe_state(scene):
         seen = observe(scene)
         return {**seen, "observation.environment_state": seen["observation.state"]}
 
-    monkeypatch.setattr(bag, "STEPS", STEPS)
-    monkeypatch.setattr(bag, "observe", observe_state)
+    monkeypatch.setattr(runs, "STEPS", STEPS)
+    monkeypatch.setattr(runs, "observe", observe_state)
 
     def load(name, *options):
         spec = importlib.util.spec_from_file_location(name, Path(__file__).parents[1] / "scripts" / f"{name}.py")

@@ -10,11 +10,11 @@ import pytest
 import tiny
 import torch
 
-from lerobot_latentsafe.baselines.simulator import SimulatorLookahead
-from lerobot_latentsafe.envs.scenes import make_scene
-from lerobot_latentsafe.evaluation import blocks_study
-from lerobot_latentsafe.evaluation.blocks_study import lead
-from lerobot_latentsafe.teleoperators.scripted.behaviors import CLOSED, begin, reach, up
+from lerobot_latentsafe.experiments.blocks import study
+from lerobot_latentsafe.experiments.blocks.simulator_lookahead import SimulatorLookahead
+from lerobot_latentsafe.experiments.blocks.study import lead
+from lerobot_latentsafe.franka.behaviors import CLOSED, begin, reach, up
+from lerobot_latentsafe.franka.scenes import make_scene
 
 SCRIPT = Path(__file__).parents[1] / "scripts" / "blocks_table2.py"
 STILL = np.zeros(7)
@@ -53,7 +53,7 @@ class Plucking:
     """In a policy's place, an operator who plucks the block, and puts it back if `back`."""
 
     def __init__(self, back):
-        self.scene, self.back = blocks_study._env().scene, back
+        self.scene, self.back = study._env().scene, back
 
     def reset(self):
         self.actions = self.pluck()
@@ -73,8 +73,8 @@ class Plucking:
 
 @pytest.mark.parametrize("back", [False, True])
 def test_success_is_that_the_block_was_picked_up_and_whether_it_still_is_stands_beside_it(back, monkeypatch):
-    monkeypatch.setattr(blocks_study, "load", lambda *names: Plucking(back))
-    row = blocks_study.run({"dreamer": "", "filter": None, "mode": "bare", "epsilon": None, "seed": 0})
+    monkeypatch.setattr(study, "load", lambda *names: Plucking(back))
+    row = study.run({"dreamer": "", "filter": None, "mode": "bare", "epsilon": None, "seed": 0})
     assert row["success"] and not row["violation"] and row["held"] != back and not row["leaning"]
 
 

@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from lerobot_latentsafe.commands import Calibrate, DatasetSource, PolicySource
 
 from lerobot_latentsafe.calibration import calibrate, episode_values, store
-from lerobot_latentsafe.commands import Calibrate, DatasetSource, PolicySource
 from lerobot_latentsafe.datasets.clips import ClipReader
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, UntrainedFilterError
 

@@ -5,14 +5,14 @@ from pathlib import Path
 import pytest
 import yaml
 
-from lerobot_latentsafe.datasets import collect_franka
-from lerobot_latentsafe.datasets.collect import FEATURES, POSITION, SOURCES, WITH_POSITION
-from lerobot_latentsafe.envs.scenes import SCENES
+from lerobot_latentsafe.collection import franka
+from lerobot_latentsafe.collection.dubins import FEATURES, POSITION, SOURCES, WITH_POSITION
+from lerobot_latentsafe.franka.scenes import SCENES
 
 FOLDER = Path(__file__).parents[1] / "datasets_cards"
 
 
-CARDS = {f"dubins_{source}": source for source in SOURCES} | {source: source for source in collect_franka.SOURCES}
+CARDS = {f"dubins_{source}": source for source in SOURCES} | {source: source for source in franka.SOURCES}
 """Name of a card -> what `latentsafe collect` calls the source."""
 
 
@@ -20,8 +20,8 @@ def recorded(source):
     """fps, robot type and features of a source's dataset."""
     if source in SOURCES:
         return 20, "latentsafe_dubins", {**FEATURES, **(POSITION if source in WITH_POSITION else {})}
-    franka = collect_franka.SOURCES[source]
-    return SCENES[franka.scene].fps, "latentsafe_franka_mujoco", collect_franka.features(franka)
+    franka = franka.SOURCES[source]
+    return SCENES[franka.scene].fps, "latentsafe_franka_mujoco", franka.features(franka)
 
 
 @pytest.mark.parametrize("card", CARDS)
@@ -46,7 +46,7 @@ def test_card_has_a_header_and_the_command_that_makes_it(card):
     assert all(f"`{name}`" in text for name in recorded(CARDS[card])[2])
 
 
-@pytest.mark.parametrize("card", collect_franka.SOURCES)
+@pytest.mark.parametrize("card", franka.SOURCES)
 def test_card_gives_the_counts_that_were_measured(card):
     counts = json.loads((FOLDER.parent / "results" / "franka" / "balance.json").read_text())[card]
     stated = re.search(r"^At seed \d+: .*$", (FOLDER / f"{card}.md").read_text(), re.MULTILINE)[0].replace(",", "")

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from lerobot_latentsafe.chunks import ChunksAhead
-from lerobot_latentsafe.shield import BasePolicy
+from lerobot_latentsafe.action_chunks import ChunksAhead
+from lerobot_latentsafe.base_policy import BasePolicy
 
 STATE = "observation.state"
 

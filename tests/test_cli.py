@@ -5,9 +5,9 @@ import pytest
 import tiny
 import torch
 
-from lerobot_latentsafe import checkpoint
 from lerobot_latentsafe.cli import VERBS, main
-from lerobot_latentsafe.evaluation.ground_truth import exact_value
+from lerobot_latentsafe.dubins.ground_truth import exact_value
+from lerobot_latentsafe.runtime import checkpoint
 
 PROVENANCE = {"command", "commit", "seeds", "cpu_minutes", "machine", "date"}
 

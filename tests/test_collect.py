@@ -7,9 +7,9 @@ import tiny
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
-from lerobot_latentsafe.datasets.collect import SOURCES, WITH_POSITION, collect_dubins
-from lerobot_latentsafe.envs import dubins
-from lerobot_latentsafe.evaluation.ground_truth import exact_value
+from lerobot_latentsafe.collection.dubins import SOURCES, WITH_POSITION, collect_dubins
+from lerobot_latentsafe.dubins import car
+from lerobot_latentsafe.dubins.ground_truth import exact_value
 
 
 def episodes(source, n=6, seed=0):
@@ -33,7 +33,7 @@ def recorded():
 
 def test_labels_are_the_sign_of_the_margin(frames, recorded):
     states = np.concatenate([e.states for e in recorded])
-    np.testing.assert_array_equal(frames["failure"].reshape(-1), dubins.margin(states) < 0)
+    np.testing.assert_array_equal(frames["failure"].reshape(-1), car.margin(states) < 0)
     assert 0 < frames["failure"].mean() < 1
 
 
@@ -43,14 +43,14 @@ def test_frames_hold_headings_and_the_action_taken_after_them(frames, recorded):
     np.testing.assert_allclose(frames["observation.state"], headings, atol=1e-6)
     np.testing.assert_allclose(frames["action"][:, 0], np.concatenate([e.turn_rates for e in recorded]))
     for episode in recorded:
-        np.testing.assert_allclose(dubins.step(episode.states[:-1], episode.turn_rates[:-1]), episode.states[1:])
+        np.testing.assert_allclose(car.step(episode.states[:-1], episode.turn_rates[:-1]), episode.states[1:])
 
 
 def test_images_are_what_the_environment_shows(dataset_root, recorded):
     dataset = LeRobotDataset(tiny.REPO_ID, root=dataset_root)
     states = np.concatenate([e.states for e in recorded])
     for i in (0, len(states) // 2):
-        env = dubins.DubinsEnv()
+        env = car.DubinsEnv()
         seen, _ = env.reset(options={"state": states[i]})
         stored = (dataset[i]["observation.image"] * 255).round().numpy().astype(np.uint8)
         np.testing.assert_array_equal(stored.transpose(1, 2, 0), seen["pixels"])
@@ -96,24 +96,24 @@ def test_labels_do_not_pass_a_policys_preprocessor(dataset_root):
 
 def test_random_source_uses_the_three_actions():
     rates = np.concatenate([e.turn_rates for e in episodes("random")])
-    assert set(rates) == set(dubins.TURN_RATES)
+    assert set(rates) == set(car.TURN_RATES)
 
 
 def test_left_only_source_never_turns_right():
     rates = np.concatenate([e.turn_rates for e in episodes("random_left_only")])
-    assert set(rates) == {0.0, dubins.MAX_TURN_RATE}
+    assert set(rates) == {0.0, car.MAX_TURN_RATE}
 
 
 def test_continuous_source_covers_the_range():
     rates = np.concatenate([e.turn_rates for e in episodes("random_continuous", 20)])
     assert len(np.unique(rates)) > 50
-    assert rates.min() < -1.0 and rates.max() > 1.0 and np.abs(rates).max() <= dubins.MAX_TURN_RATE
+    assert rates.min() < -1.0 and rates.max() > 1.0 and np.abs(rates).max() <= car.MAX_TURN_RATE
 
 
 def test_careful_source_stays_safe_and_reckless_does_not():
     careful, reckless = episodes("careful", 15), episodes("reckless", 15)
-    assert not any((dubins.margin(e.states) < 0).any() for e in careful)
-    assert np.mean([(dubins.margin(e.states) < 0).any() for e in reckless]) > 0.3
+    assert not any((car.margin(e.states) < 0).any() for e in careful)
+    assert np.mean([(car.margin(e.states) < 0).any() for e in reckless]) > 0.3
     assert all(exact_value(e.states[:1])[0] > 0 for e in careful + reckless)
 
 
@@ -133,7 +133,7 @@ def test_demonstrations_also_store_the_position(tmp_path):
     assert "reckless" in WITH_POSITION
     assert dataset.features["observation.environment_state"]["names"] == ["x.pos", "y.pos"]
     info = json.loads((tmp_path / "demo" / "meta" / "info.json").read_text())
-    assert info["fps"] == dubins.FPS and info["robot_type"] == "latentsafe_dubins"
+    assert info["fps"] == car.FPS and info["robot_type"] == "latentsafe_dubins"
 
 
 def test_unknown_source_lists_the_known_ones(tmp_path):

@@ -6,12 +6,12 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from tiny import save_franka_filter
 
-from lerobot_latentsafe.datasets import collect_franka
-from lerobot_latentsafe.datasets.collect_franka import SOURCES, Source
-from lerobot_latentsafe.datasets.collect_franka import collect_franka as collect
-from lerobot_latentsafe.datasets.interruptions import BRIEF, RETREATING, Interruptions
+from lerobot_latentsafe.collection import franka
+from lerobot_latentsafe.collection.franka import SOURCES, Source
+from lerobot_latentsafe.collection.franka import collect_franka as collect
+from lerobot_latentsafe.collection.interventions import BRIEF, RETREATING, Interruptions
 from lerobot_latentsafe.datasets.labels import FailureLabels
-from lerobot_latentsafe.robots.franka_interface import action_limits
+from lerobot_latentsafe.franka.actions import action_limits
 
 COLUMNS = ("observation.state", "action", "failure", "next.reward", "episode_index")
 
@@ -19,9 +19,9 @@ COLUMNS = ("observation.state", "action", "failure", "next.reward", "episode_ind
 @pytest.fixture
 def tiny(monkeypatch):
     """Blocks at 32 pixels, an episode a part."""
-    scene = replace(collect_franka.SCENES["blocks"], image_size=32)
-    monkeypatch.setitem(collect_franka.SCENES, "blocks", scene)
-    monkeypatch.setattr(collect_franka, "EPISODES_A_PART", 1)
+    scene = replace(franka.SCENES["blocks"], image_size=32)
+    monkeypatch.setitem(franka.SCENES, "blocks", scene)
+    monkeypatch.setattr(franka, "EPISODES_A_PART", 1)
     monkeypatch.setitem(SOURCES, "tiny", Source("blocks", {"pluck_careless": 1, "pluck_careful": 1}))
 
 
@@ -31,7 +31,7 @@ def columns(dataset):
 
 def test_a_killed_recording_goes_on_and_equals_an_undisturbed_one(tiny, tmp_path, monkeypatch):
     whole = columns(collect("tiny", "me/tiny", tmp_path / "whole", 2, seed=0))
-    record, left = collect_franka.episode_frames, iter([True, False])
+    record, left = franka.episode_frames, iter([True, False])
 
     def killed_in_the_second(*args):
         frames = record(*args)
@@ -40,12 +40,12 @@ def test_a_killed_recording_goes_on_and_equals_an_undisturbed_one(tiny, tmp_path
         next(frames)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(collect_franka, "episode_frames", killed_in_the_second)
+    monkeypatch.setattr(franka, "episode_frames", killed_in_the_second)
     with pytest.raises(KeyboardInterrupt):
         collect("tiny", "me/tiny", tmp_path / "cut", 2, seed=0)
     assert not (tmp_path / "cut").exists()
     calls = []
-    monkeypatch.setattr(collect_franka, "episode_frames", lambda *args: calls.append(args[2]) or record(*args))
+    monkeypatch.setattr(franka, "episode_frames", lambda *args: calls.append(args[2]) or record(*args))
     resumed = columns(collect("tiny", "me/tiny", tmp_path / "cut", 2, seed=0))
     assert calls == [1]  # the finished part was kept
     for name in COLUMNS:
@@ -68,7 +68,7 @@ def test_several_workers_record_the_same(tiny, tmp_path, monkeypatch):
 
     alone = columns(collect("tiny", "me/tiny", tmp_path / "alone", 2, seed=0))
     # A thread in place of processes, which would not know of the tiny source.
-    monkeypatch.setattr(collect_franka, "get_context", lambda method: SimpleNamespace(Pool=lambda workers: Pool(1)))
+    monkeypatch.setattr(franka, "get_context", lambda method: SimpleNamespace(Pool=lambda workers: Pool(1)))
     together = columns(collect("tiny", "me/tiny", tmp_path / "together", 2, seed=0, workers=2))
     for name in COLUMNS:
         np.testing.assert_array_equal(together[name], alone[name])
@@ -81,7 +81,7 @@ def test_branches_share_their_grasp_and_differ_after_it():
     with LatentSafeFrankaMujoco(LatentSafeFrankaMujocoConfig(image_size=32)) as robot:
         first = {}
         for episode in (0, 1, 5):
-            frames = collect_franka.episode_frames(robot, SOURCES["bag_branches"], episode, 0)
+            frames = franka.episode_frames(robot, SOURCES["bag_branches"], episode, 0)
             first[episode] = [next(frames) for _ in range(4)]
             assert robot.scene.held_segment() is not None
     state = lambda episode, t: first[episode][t]["observation.state"]  # noqa: E731
@@ -93,7 +93,7 @@ def test_branches_share_their_grasp_and_differ_after_it():
 def test_what_the_operator_of_a_pushed_hand_wants_is_recorded(tiny):
     from dataclasses import replace
 
-    from lerobot_latentsafe.robots.franka_interface import action_limits
+    from lerobot_latentsafe.franka.actions import action_limits
     from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
     from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
 
@@ -102,7 +102,7 @@ def test_what_the_operator_of_a_pushed_hand_wants_is_recorded(tiny):
     with LatentSafeFrankaMujoco(LatentSafeFrankaMujocoConfig(scene="blocks", image_size=32)) as robot:
         runs, poses = [], []
         for source in (steady, replace(steady, pushed=0.1)):
-            frames = list(collect_franka.episode_frames(robot, source, 0, seed=3))
+            frames = list(franka.episode_frames(robot, source, 0, seed=3))
             runs.append(np.stack([frame["action"] for frame in frames]))
             poses.append(np.stack([frame["observation.state"][8:11] for frame in frames]))
     pushed = runs[1]
@@ -135,17 +135,17 @@ class Closes:
 
 
 def test_a_policy_is_recorded_as_it_acts_and_is_overridden(tiny, monkeypatch):
-    from lerobot_latentsafe.datasets import policy_operator
+    from lerobot_latentsafe.collection import policy_operator
     from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
     from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
 
     monkeypatch.setattr(policy_operator, "BasePolicy", Closes)
-    collect_franka._policy_operator.cache_clear()
+    franka._policy_operator.cache_clear()
     source = Source("blocks", {"closes": 2}, policies=True, hand=BRIEF, seconds=3.0)
     with LatentSafeFrankaMujoco(LatentSafeFrankaMujocoConfig(scene="blocks", image_size=32)) as robot:
-        runs = [list(collect_franka.episode_frames(robot, source, episode, 0)) for episode in (0, 0, 1)]
-    operator = collect_franka._policy_operator("closes", 20, BRIEF, None)
-    collect_franka._policy_operator.cache_clear()
+        runs = [list(franka.episode_frames(robot, source, episode, 0)) for episode in (0, 0, 1)]
+    operator = franka._policy_operator("closes", 20, BRIEF, None)
+    franka._policy_operator.cache_clear()
     actions = np.stack([[frame["action"] for frame in frames] for frames in runs])
     assert actions.shape == (3, 60, 7)
     np.testing.assert_array_equal(actions[0], actions[1])
@@ -170,17 +170,17 @@ def test_a_filter_may_say_when(tiny, tmp_path, monkeypatch):
         path = str(save_franka_filter(tmp_path / str(epsilon), epsilon=epsilon))
         source = Source("blocks", {"closes": 1}, policies=True, hand=hand, shield=path, seconds=1.0)
         with LatentSafeFrankaMujoco(LatentSafeFrankaMujocoConfig(scene="blocks", image_size=32)) as robot:
-            frames = list(collect_franka.episode_frames(robot, source, 0, 0))
+            frames = list(franka.episode_frames(robot, source, 0, 0))
         actions = np.stack([frame["action"] for frame in frames])
         lowered = actions[:, 0] == 0
         assert lowered[0] != passes and not (passes and lowered.any())
         assert (actions[lowered, 2] < 0).all() and (actions[~lowered, 2] == np.float32(0.01)).all()
         # What was done instead is told to the policy, and to the filter, which remembers it.
-        operator = collect_franka._policy_operator("closes", 20, hand, path)
+        operator = franka._policy_operator("closes", 20, hand, path)
         np.testing.assert_allclose(np.reshape(operator.policy.executed, (-1, 7)), actions[lowered], atol=1e-6)
         executed = operator.filter.denormalise_action(operator.filter.shield.executed)[0]
         np.testing.assert_allclose(executed.numpy(), actions[-1], atol=1e-5)
-    collect_franka._policy_operator.cache_clear()
+    franka._policy_operator.cache_clear()
 
 
 def test_an_operator_is_interrupted_while_the_fingers_close_and_goes_on(tiny):
@@ -191,7 +191,7 @@ def test_an_operator_is_interrupted_while_the_fingers_close_and_goes_on(tiny):
     for hand in (None, RETREATING):
         source = Source("bag", {"open_end": 1}, hand=hand, seconds=8.0)
         with LatentSafeFrankaMujoco(LatentSafeFrankaMujocoConfig(scene="bag", image_size=32)) as robot:
-            frames = list(collect_franka.episode_frames(robot, source, 3, 0))
+            frames = list(franka.episode_frames(robot, source, 3, 0))
         actions[hand] = np.stack([frame["action"] for frame in frames])
     alone, interrupted = actions.values()
     differs = np.abs(alone - interrupted).max(1) > 0
@@ -243,14 +243,14 @@ def test_bad_requests_are_refused(tiny, tmp_path):
 def test_a_full_disk_leaves_finished_parts(tiny, tmp_path, monkeypatch):
     import errno
 
-    record = collect_franka.episode_frames
+    record = franka.episode_frames
 
     def full_disk(robot, source, episode, seed):
         if episode == 1:
             raise OSError(errno.ENOSPC, "No space left on device")
         return record(robot, source, episode, seed)
 
-    monkeypatch.setattr(collect_franka, "episode_frames", full_disk)
+    monkeypatch.setattr(franka, "episode_frames", full_disk)
     with pytest.raises(OSError, match="No space left"):
         collect("tiny", "me/tiny", tmp_path / "x", 2, seed=0)
     finished = LeRobotDataset("me/tiny", root=tmp_path / "x.parts" / "000000_000001")

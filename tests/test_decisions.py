@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+from lerobot_latentsafe.decision import LawOptions
+from lerobot_latentsafe.modeling_latentsafe import load_filter
 
 FILE = Path(__file__).parent / "data" / "decisions.npz"
 FILTERS = ("dubins", "bag", "blocks")
@@ -19,22 +20,15 @@ VARIANTS = {
     "committed": {},
     "faults": {},
     "monitor": {"mode": "monitor"},
-    "critic_alone": {"lookahead": 0, "guard": 1},
-    "look_ahead": {"lookahead": 8, "guard": 2, "epsilon": 0.3, "release": 0.6},
-    "plan": {"law": "plan", "lookahead": 10},
-    "margin": {"law": "margin"},
-    "short_history": {"memory": 6},
-    "samples": {"samples": 3, "guard": 2, "lookahead": 4},
+    "critic_alone": {"lookahead": 0, "proposal_steps": 1},
+    "look_ahead": {"lookahead": 8, "proposal_steps": 2, "epsilon": 0.3, "resume_above": 0.6},
+    "plan": {"name": "plan", "lookahead": 10},
+    "margin": {"name": "margin"},
+    "short_history": {"history_frames": 6},
+    "samples": {"samples": 3, "proposal_steps": 2, "lookahead": 4},
 }
-"""What is set in the filter's configuration; "faults" breaks what it is shown instead."""
+"""Changes of the filter's law; "faults" breaks what it is shown instead."""
 OUTCOMES = ("action", "value", "margin", "reason", "intervened")
-
-
-def load(name: str, variant: str) -> LatentSafePolicy:
-    policy = LatentSafePolicy.from_pretrained(name).eval()
-    for option, value in VARIANTS[variant].items():
-        setattr(policy.config, option, value)
-    return policy
 
 
 def break_something(t: int, batch: dict, proposed: torch.Tensor) -> tuple[dict, torch.Tensor | None, float]:
@@ -61,7 +55,7 @@ def break_something(t: int, batch: dict, proposed: torch.Tensor) -> tuple[dict, 
 @torch.no_grad()
 def decide_all(name: str, variant: str, seen: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Decisions (T, 2, ...) along the recorded steps."""
-    policy, rows = load(name, variant), []
+    policy, rows = load_filter(name, law=LawOptions(**VARIANTS[variant])), []
     for t in range(len(seen["action"])):
         batch = {
             key: torch.from_numpy(value[t]).float() / (255 if value.dtype == np.uint8 else 1)

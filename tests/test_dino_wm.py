@@ -8,8 +8,9 @@ import tiny
 import torch
 import yaml
 
-from lerobot_latentsafe.world_models import Clip, DinoWM, WorldModelConfig
-from lerobot_latentsafe.world_models.base import map_latent, select
+from lerobot_latentsafe.datasets.clips import Clip
+from lerobot_latentsafe.latent import map_latent, select
+from lerobot_latentsafe.world_models import DinoWM, WorldModelConfig
 
 KEYS, STATE_DIM, ACTION_DIM = ["observation.images.wrist", "observation.images.front"], 3, 2
 SIDE, TOKEN_DIM = 3, 4

@@ -14,16 +14,16 @@ import torch
 from safetensors.torch import load_file
 from test_hub import hub  # noqa: F401
 
-from lerobot_latentsafe.baselines.dreamer import recorders
-from lerobot_latentsafe.baselines.dreamer.modeling_dreamer import LatentSafeDreamerPolicy, WorldModelMismatchError
-from lerobot_latentsafe.baselines.dreamer.replay import CAMERA_KEYS, Replay
-from lerobot_latentsafe.baselines.dreamer.training import DreamerTraining, TrainDreamer
-from lerobot_latentsafe.checkpoint import CheckpointError
-from lerobot_latentsafe.evaluation.blocks_study import world_model_of
+from lerobot_latentsafe.base_policy import BasePolicy
+from lerobot_latentsafe.experiments.blocks import recorders
+from lerobot_latentsafe.experiments.blocks.dreamer_training import DreamerTraining, TrainDreamer
+from lerobot_latentsafe.experiments.blocks.replay import CAMERA_KEYS, Replay
+from lerobot_latentsafe.experiments.blocks.study import world_model_of
+from lerobot_latentsafe.franka.actions import STATE_NAMES, action_limits
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, UntrainedFilterError
-from lerobot_latentsafe.robots.franka_interface import STATE_NAMES, action_limits
-from lerobot_latentsafe.shield import BasePolicy
-from lerobot_latentsafe.training import halve_weights, train_reachability
+from lerobot_latentsafe.policies.dreamer.modeling_dreamer import LatentSafeDreamerPolicy, WorldModelMismatchError
+from lerobot_latentsafe.runtime.checkpoint import CheckpointError, halve_weights
+from lerobot_latentsafe.training import train_reachability
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -354,7 +354,7 @@ def test_from_nothing_it_says_how_to_train_one(task_policy):
 
 def test_filter_is_trained_on_its_world_model_and_shields_it(trained, tmp_path):
     from lerobot_latentsafe import LatentSafeBlocksEnv
-    from lerobot_latentsafe.evaluation.shielding import compare
+    from lerobot_latentsafe.evaluation.statistics import compare
 
     episodes = tiny.metadata(trained / "episodes", "local/blocks_dreamer")
     assert episodes.total_episodes == 2 + 2 * 2

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lerobot_latentsafe.baselines.dreamer.behavior import (
+from lerobot_latentsafe.policies.dreamer.behavior import (
     TERMS,
     Actor,
     BehaviorConfig,

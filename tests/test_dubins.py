@@ -5,37 +5,37 @@ from gymnasium.utils.env_checker import check_env
 from lerobot.envs import make_env, preprocess_observation
 
 from lerobot_latentsafe import LatentSafeDubinsEnv
-from lerobot_latentsafe.envs import dubins
-from lerobot_latentsafe.evaluation.ground_truth import exact_value
+from lerobot_latentsafe.dubins import car
+from lerobot_latentsafe.dubins.ground_truth import exact_value
 
 
 def command(turn_rate=0.0):
-    return np.array([turn_rate, dubins.SPEED], np.float32)
+    return np.array([turn_rate, car.SPEED], np.float32)
 
 
 def draw(x, y, heading, size=128):
-    return dubins.Renderer(size)(np.array([[x, y, heading]]))[0]
+    return car.Renderer(size)(np.array([[x, y, heading]]))[0]
 
 
 def pixel_of(x, y, size=128):
     """(row, column) of a point in metres."""
-    return int((dubins.VIEW - y) / (2 * dubins.VIEW) * size), int((x + dubins.VIEW) / (2 * dubins.VIEW) * size)
+    return int((car.VIEW - y) / (2 * car.VIEW) * size), int((x + car.VIEW) / (2 * car.VIEW) * size)
 
 
 def test_euler_step_by_hand():
-    after = dubins.step(np.array([0.2, -0.1, np.pi / 2]), 1.0)
+    after = car.step(np.array([0.2, -0.1, np.pi / 2]), 1.0)
     np.testing.assert_allclose(after, [0.2, -0.05, np.pi / 2 + 0.05], atol=1e-12)
 
 
 def test_step_is_batched():
     states = np.array([[0.0, 0.0, 0.0], [0.5, 0.5, np.pi]])
     expected = [[0.05, 0.0, 0.0625], [0.45, 0.5, np.pi - 0.0625]]
-    np.testing.assert_allclose(dubins.step(states, np.array([1.25, -1.25])), expected, atol=1e-12)
+    np.testing.assert_allclose(car.step(states, np.array([1.25, -1.25])), expected, atol=1e-12)
 
 
 def test_margin_is_squared_distance_beyond_the_radius():
     states = np.array([[0.0, 0.0, 1.0], [0.5, 0.0, 1.0], [0.6, 0.8, 1.0]])
-    np.testing.assert_allclose(dubins.margin(states), [-0.25, 0.0, 0.75])
+    np.testing.assert_allclose(car.margin(states), [-0.25, 0.0, 0.75])
 
 
 # -- renderer ---
@@ -43,7 +43,7 @@ def test_margin_is_squared_distance_beyond_the_radius():
 
 def test_one_image_equals_the_same_image_of_a_batch():
     states = np.random.default_rng(0).uniform(-1.3, 1.3, (37, 3))
-    renderer = dubins.Renderer()
+    renderer = car.Renderer()
     batch = renderer(states)
     for i in (0, 16, 36):
         np.testing.assert_array_equal(renderer(states[i : i + 1])[0], batch[i])
@@ -98,10 +98,10 @@ def test_other_sizes(size):
 # -- environment ---
 
 
-@pytest.mark.parametrize("variant", dubins.DubinsEnv.variants)
+@pytest.mark.parametrize("variant", car.DubinsEnv.variants)
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_env_follows_the_gymnasium_api(variant):
-    check_env(dubins.DubinsEnv(variant), skip_render_check=True)
+    check_env(car.DubinsEnv(variant), skip_render_check=True)
 
 
 def test_env_is_registered():
@@ -110,7 +110,7 @@ def test_env_is_registered():
 
 
 def test_equal_seeds_give_equal_starts():
-    first, second = dubins.DubinsEnv(), dubins.DubinsEnv("discrete")
+    first, second = car.DubinsEnv(), car.DubinsEnv("discrete")
     for seed in range(3):
         observation, info = first.reset(seed=seed)
         other, other_info = second.reset(seed=seed)
@@ -119,58 +119,58 @@ def test_equal_seeds_give_equal_starts():
     assert not np.array_equal(first.reset(seed=0)[1]["state"], first.reset(seed=1)[1]["state"])
 
 
-@pytest.mark.parametrize("variant", dubins.DubinsEnv.variants)
+@pytest.mark.parametrize("variant", car.DubinsEnv.variants)
 def test_every_start_can_be_kept_safe(variant):
-    env = dubins.DubinsEnv(variant)
+    env = car.DubinsEnv(variant)
     states = np.array([env.reset(seed=seed)[1]["state"] for seed in range(10)])
     assert (exact_value(states) > 0).all()
 
 
 def test_discrete_variant_snaps_to_three_turn_rates():
-    env = dubins.DubinsEnv("discrete")
+    env = car.DubinsEnv("discrete")
     for asked, taken in ((0.6, 0.0), (0.7, 1.25), (-9.0, -1.25)):
         env.reset(seed=0, options={"state": (-0.9, 0.0, 0.0)})
         env.step(command(asked))
-        assert env.state[2] == pytest.approx(taken * dubins.DT)
+        assert env.state[2] == pytest.approx(taken * car.DT)
 
 
 def test_continuous_variant_takes_any_turn_rate_within_limits():
-    env = dubins.DubinsEnv()
+    env = car.DubinsEnv()
     for asked, taken in ((0.6, 0.6), (3.0, 1.25)):
         env.reset(seed=0, options={"state": (-0.9, 0.0, 0.0)})
         env.step(command(asked))
-        assert env.state[2] == pytest.approx(taken * dubins.DT)
+        assert env.state[2] == pytest.approx(taken * car.DT)
 
 
 def test_speed_is_held_whatever_is_asked():
-    env = dubins.DubinsEnv()
+    env = car.DubinsEnv()
     env.reset(options={"state": (-0.9, 0.0, 0.0)})
     env.step(np.array([0.0, 7.0]))
-    assert env.state[0] == pytest.approx(-0.9 + dubins.DT * dubins.SPEED)
+    assert env.state[0] == pytest.approx(-0.9 + car.DT * car.SPEED)
 
 
 def test_unknown_variant_lists_the_known_ones():
     with pytest.raises(ValueError, match=r"'sideways'.*continuous, discrete, anywhere"):
-        dubins.DubinsEnv("sideways")
+        car.DubinsEnv("sideways")
 
 
 @pytest.mark.parametrize("action", [[np.nan, 1.0], [0.0, np.inf], [0.0], [0.0, 1.0, 0.0], []])
 def test_bad_action_is_refused(action):
-    env = dubins.DubinsEnv()
+    env = car.DubinsEnv()
     env.reset(seed=0)
     with pytest.raises(ValueError, match="expected a finite turn rate"):
         env.step(np.array(action))
 
 
 def test_success_is_arriving_without_a_violation():
-    env = dubins.DubinsEnv()
+    env = car.DubinsEnv()
     env.reset(options={"state": (0.87, 0.8, 0.0)})
     _, reward, terminated, truncated, info = env.step(command())
     assert (reward, terminated, truncated, info["is_success"], info["failure"]) == (1.0, True, False, True, False)
 
 
 def test_a_violation_is_remembered_and_rules_success_out():
-    env = dubins.DubinsEnv()
+    env = car.DubinsEnv()
     env.reset(options={"state": (0.0, 0.45, 0.0)})
     violated, over = [], False
     while not over:
@@ -183,14 +183,14 @@ def test_a_violation_is_remembered_and_rules_success_out():
 
 
 def test_leaving_the_view_ends_without_success():
-    env = dubins.DubinsEnv()
+    env = car.DubinsEnv()
     env.reset(options={"state": (-1.08, 0.0, np.pi)})
     _, reward, terminated, truncated, info = env.step(command())
     assert terminated and not truncated and reward == 0.0 and not info["is_success"]
 
 
 def test_episode_is_truncated_at_its_length():
-    env = dubins.DubinsEnv(episode_length=3)
+    env = car.DubinsEnv(episode_length=3)
     env.reset(options={"state": (-0.9, 0.8, 0.0)})
     assert [env.step(command())[3] for _ in range(3)] == [False, False, True]
 

@@ -6,9 +6,9 @@ import sys
 import pytest
 import torch
 
-from lerobot_latentsafe.world_models import encoders
-from lerobot_latentsafe.world_models.encoders import EfficientNetLite0, EncoderError, load_encoder
-from lerobot_latentsafe.world_models.perception import Perception, PerceptionConfig
+from lerobot_latentsafe.encoders import patch_encoders
+from lerobot_latentsafe.encoders.patch_encoders import EfficientNetLite0, EncoderError, load_encoder
+from lerobot_latentsafe.encoders.perception import Perception, PerceptionConfig
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def test_auto_falls_back_to_the_bundled_encoder_and_says_so(monkeypatch, caplog)
     def out_of_reach(name):
         raise EncoderError("the Hub is down")
 
-    monkeypatch.setattr(encoders, "load_dino", out_of_reach)
+    monkeypatch.setattr(patch_encoders, "load_dino", out_of_reach)
     with caplog.at_level(logging.WARNING):
         assert load_encoder("auto").name == "efficientnet_lite0"
     assert "the Hub is down" in caplog.text and "EfficientNet-Lite0 instead" in caplog.text

@@ -1,10 +1,10 @@
 import numpy as np
 import torch
 
-from lerobot_latentsafe.envs.bag import VARIANTS
-from lerobot_latentsafe.evaluation.feature_picture import draw_features, principal_colours, see_variants
-from lerobot_latentsafe.evaluation.figures import save
-from lerobot_latentsafe.world_models.encoders import load_encoder
+from lerobot_latentsafe.encoders.patch_encoders import load_encoder
+from lerobot_latentsafe.experiments.bag.features import draw_features, principal_colours, see_variants
+from lerobot_latentsafe.franka.bag import VARIANTS
+from lerobot_latentsafe.reports.figures import save
 
 
 def test_equal_tokens_have_equal_colours_and_different_ones_do_not():

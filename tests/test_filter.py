@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from lerobot_latentsafe.filter import Reason, least_restrictive
+from lerobot_latentsafe.decision import Reason, least_restrictive
 
 PROPOSED, FALLBACK = torch.tensor([[0.5, 1.0]]), torch.tensor([[-1.0, 1.0]])
 

@@ -12,12 +12,7 @@ from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_latentsafe.datasets.build_cache import build_frame_cache
-from lerobot_latentsafe.datasets.frame_cache import (
-    FrameCache,
-    FrameCacheError,
-    dataset_fingerprint,
-    to_model_images,
-)
+from lerobot_latentsafe.datasets.frame_cache import FrameCache, FrameCacheError, dataset_fingerprint, to_model_images
 from lerobot_latentsafe.datasets.labels import FailureLabels
 
 

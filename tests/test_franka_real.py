@@ -9,10 +9,10 @@ import pytest
 from lerobot.robots.utils import make_robot_from_config
 from lerobot.utils.errors import DeviceNotConnectedError
 
+from lerobot_latentsafe.franka.actions import ACTION_NAMES, GRIPPER_WIDTH, HOME, JOINT_NAMES, STATE_NAMES
 from lerobot_latentsafe.robots.franka.config_franka import LatentSafeFrankaConfig
 from lerobot_latentsafe.robots.franka.driver import ArmState, FrankaError, FrankyDriver, GripperError
 from lerobot_latentsafe.robots.franka.franka import DOWN, LatentSafeFranka
-from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, GRIPPER_WIDTH, HOME, JOINT_NAMES, STATE_NAMES
 
 STILL = dict.fromkeys(ACTION_NAMES, 0.0) | {"gripper.pos": 1.0}
 START = np.array([0.45, 0.0, 0.30])

@@ -8,11 +8,11 @@ from lerobot.robots.utils import make_robot_from_config
 from lerobot.teleoperators.utils import make_teleoperator_from_config
 from lerobot.utils.errors import DeviceNotConnectedError
 
-from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, DELTA_NAMES, JOINT_NAMES, STATE_NAMES
+from lerobot_latentsafe.franka.actions import ACTION_NAMES, DELTA_NAMES, JOINT_NAMES, STATE_NAMES
+from lerobot_latentsafe.franka.behaviors import BAG, BLOCKS
 from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
 from lerobot_latentsafe.teleoperators.end_effector.config_end_effector import DeviceConfig, LatentSafeEndEffectorConfig
 from lerobot_latentsafe.teleoperators.end_effector.end_effector import LatentSafeEndEffector
-from lerobot_latentsafe.teleoperators.scripted.behaviors import BAG, BLOCKS
 from lerobot_latentsafe.teleoperators.scripted.config_scripted import BEHAVIORS, LatentSafeScriptedConfig
 
 STILL = dict.fromkeys(ACTION_NAMES, 0.0) | {"gripper.pos": 1.0}

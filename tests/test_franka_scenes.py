@@ -4,12 +4,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from lerobot_latentsafe.envs import bag, franka
 from lerobot_latentsafe.envs.franka_env import BagEnv, BlocksEnv
-from lerobot_latentsafe.envs.scenes import SCENES, make_scene
-from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, HOME, STATE_NAMES, action_limits, read_action
-from lerobot_latentsafe.teleoperators.scripted import behaviors
-from lerobot_latentsafe.teleoperators.scripted.behaviors import begin
+from lerobot_latentsafe.franka import bag, behaviors, scene
+from lerobot_latentsafe.franka.actions import ACTION_NAMES, HOME, STATE_NAMES, action_limits, read_action
+from lerobot_latentsafe.franka.behaviors import begin
+from lerobot_latentsafe.franka.scenes import SCENES, make_scene
 
 
 @pytest.fixture(scope="module")
@@ -51,8 +50,8 @@ def test_commands_stay_in_the_workspace_and_within_limits(blocks_scene):
     blocks_scene.reset(0)
     for _ in range(40):
         blocks_scene.step(np.array([1.0, 0, -1.0, 0, 0, 0, 1]))
-    assert blocks_scene.controller.position[0] == pytest.approx(franka.WORKSPACE_HIGH[0])
-    assert blocks_scene.controller.position[2] == pytest.approx(franka.WORKSPACE_LOW[2])
+    assert blocks_scene.controller.position[0] == pytest.approx(scene.WORKSPACE_HIGH[0])
+    assert blocks_scene.controller.position[2] == pytest.approx(scene.WORKSPACE_LOW[2])
     assert not blocks_scene.exploded()
 
 
@@ -305,7 +304,7 @@ def test_a_missing_opengl_library_names_the_package(monkeypatch):
     def fail(*args, **kwargs):
         raise ImportError("libEGL.so.1: cannot open shared object file")
 
-    monkeypatch.setattr(franka.mujoco, "Renderer", fail)
+    monkeypatch.setattr(scene.mujoco, "Renderer", fail)
     with pytest.raises(RuntimeError, match=r"libEGL.*apt-get install libegl1 libgl1-mesa-dri"):
         make_scene("blocks", image_size=32).render("front")
 

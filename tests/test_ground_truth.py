@@ -3,8 +3,8 @@ import sys
 import numpy as np
 import pytest
 
-from lerobot_latentsafe.envs import dubins
-from lerobot_latentsafe.evaluation.ground_truth import (
+from lerobot_latentsafe.dubins import car
+from lerobot_latentsafe.dubins.ground_truth import (
     PAPER_GRID,
     exact_value,
     grid_states,
@@ -23,11 +23,11 @@ def random_states(n=2000, half_width=1.1, seed=0):
 def brute_force(states, turn_rates, horizon):
     """V by trying every action sequence of this length."""
     n, k = len(states), len(turn_rates)
-    worst = dubins.margin(states)
+    worst = car.margin(states)
     for _ in range(horizon):
         states, worst = np.repeat(states, k, 0), np.repeat(worst, k)
-        states = dubins.step(states, np.tile(turn_rates, len(states) // k))
-        worst = np.minimum(worst, dubins.margin(states))
+        states = car.step(states, np.tile(turn_rates, len(states) // k))
+        worst = np.minimum(worst, car.margin(states))
     return worst.reshape(n, -1).max(1)
 
 
@@ -40,22 +40,22 @@ def test_inside_the_disc_is_unsafe_and_far_away_is_safe():
 
 def test_head_on_close_up_is_doomed_but_not_from_afar():
     value = exact_value(np.array([[-0.6, 0.0, 0.0], [-1.1, 0.0, 0.0]]))
-    assert value[0] < 0 < dubins.margin(np.array([-0.6, 0.0, 0.0]))
+    assert value[0] < 0 < car.margin(np.array([-0.6, 0.0, 0.0]))
     assert value[1] > 0
 
 
 def test_no_action_sequence_beats_the_oracle():
     states = random_states(5000, half_width=0.7)
     value, distance = exact_value(states), np.hypot(states[:, 0], states[:, 1])
-    near = (distance > dubins.RADIUS) & (distance < 0.75)  # 10 steps take it past the disc
+    near = (distance > car.RADIUS) & (distance < 0.75)  # 10 steps take it past the disc
     doomed_by_a_hair = states[near & (value < 0) & (value > -0.01)][:15]
     assert len(doomed_by_a_hair) == 15
-    assert (brute_force(doomed_by_a_hair, dubins.TURN_RATES, 10) < 0).all()
+    assert (brute_force(doomed_by_a_hair, car.TURN_RATES, 10) < 0).all()
 
 
 def test_oracle_is_the_best_of_all_sequences_in_sign():
     states = random_states(300, half_width=0.7)
-    tried = brute_force(states, dubins.TURN_RATES, 7)
+    tried = brute_force(states, car.TURN_RATES, 7)
     np.testing.assert_array_equal(exact_value(states, n_steps=7) > 0, tried > 0)
 
 

@@ -6,8 +6,8 @@ import pytest
 import tiny
 import torch
 
-from lerobot_latentsafe.world_models import Clip
-from lerobot_latentsafe.world_models.base import select
+from lerobot_latentsafe.datasets.clips import Clip
+from lerobot_latentsafe.latent import select
 
 STATE_DIM, ACTION_DIM = 2, 2
 

@@ -5,9 +5,9 @@ import torch
 from hub_stub import Hub
 from huggingface_hub import ModelCard, constants
 
-from lerobot_latentsafe.checkpoint import CheckpointError
-from lerobot_latentsafe.hub import HubUnreachableError, push_filter
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, UntrainedFilterError
+from lerobot_latentsafe.runtime.checkpoint import CheckpointError
+from lerobot_latentsafe.runtime.hub import HubUnreachableError, push_filter
 
 
 def point_to(monkeypatch, url, cache):
@@ -233,8 +233,8 @@ def test_an_encoder_with_other_weights_is_refused(hub, seeing):
 
 def test_card_names_the_encoder_and_what_was_measured(hub, seeing, tmp_path):
     from lerobot_latentsafe.cli import main
-    from lerobot_latentsafe.evaluation.rollouts import wilson, write_json
-    from lerobot_latentsafe.training import save_filter
+    from lerobot_latentsafe.evaluation.statistics import wilson, write_json
+    from lerobot_latentsafe.runtime.checkpoint import save_filter
 
     save_filter(seeing, tmp_path / "filter")
     rates = {"spilled": wilson(3, 100), "success": wilson(90, 100), "overridden_share": 0.123, "lost": [1, 2]}

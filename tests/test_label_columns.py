@@ -6,10 +6,10 @@ import tiny
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_latentsafe.cli import main
+from lerobot_latentsafe.datasets.columns import push_dataset, write_columns
 from lerobot_latentsafe.datasets.labels import FailureLabels, LabelFileError
-from lerobot_latentsafe.hub import HubUnreachableError
-from lerobot_latentsafe.labeling.columns import push_dataset, write_columns
 from lerobot_latentsafe.labeling.store import LabelStore
+from lerobot_latentsafe.runtime.hub import HubUnreachableError
 
 
 @pytest.fixture

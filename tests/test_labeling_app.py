@@ -14,9 +14,9 @@ import tiny
 pytest.importorskip("starlette", reason="needs the label extra")
 from starlette.testclient import TestClient
 
+from lerobot_latentsafe.datasets.episodes import DatasetFrames
 from lerobot_latentsafe.labeling import app as app_module
 from lerobot_latentsafe.labeling.app import LabelServer, listen
-from lerobot_latentsafe.labeling.frames import DatasetFrames
 from lerobot_latentsafe.labeling.store import LabelStore
 
 TOKEN, HOST = "right-token", "http://127.0.0.1:8765"

@@ -16,7 +16,7 @@ import pytest
 import tiny
 from lerobot.utils.io_utils import write_video
 
-from lerobot_latentsafe.evaluation import report
+from lerobot_latentsafe.reports import html
 
 pytest.importorskip("starlette", reason="needs the label extra")
 sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright (the dev extra)")
@@ -251,9 +251,9 @@ def test_labels_survive_a_kill_in_the_middle(filmed, browser, tmp_path):
 def test_a_report_shows_videos_on_screen_and_frames_on_paper(browser, tmp_path):
     grey = [np.full((32, 48, 3), level, np.uint8) for level in range(0, 200, 20)]
     write_video(str(tmp_path / "run.mp4"), grey, 5)
-    frames = report.strip(grey[:2], ["first", "second"])
-    parts = [report.video(tmp_path / "run.mp4", "a run"), report.player(tmp_path / "run.mp4", [], 2.0, "", frames)]
-    report.write_report(tmp_path / "report.html", "runs", parts)
+    frames = html.strip(grey[:2], ["first", "second"])
+    parts = [html.video(tmp_path / "run.mp4", "a run"), html.player(tmp_path / "run.mp4", [], 2.0, "", frames)]
+    html.write_report(tmp_path / "report.html", "runs", parts)
     page = browser.new_page()
     page.goto(f"file://{tmp_path / 'report.html'}")
     for medium, videos, strips in (("screen", True, False), ("print", False, True)):

@@ -139,7 +139,7 @@ def test_folder_that_cannot_be_written_is_a_message(root, monkeypatch):
 
 
 def test_labels_of_another_dataset_are_refused_and_kept(store, root, tmp_path):
-    from lerobot_latentsafe.datasets.collect import collect_dubins
+    from lerobot_latentsafe.collection.dubins import collect_dubins
 
     store.label("spilled", 3, 2, "ann")
     collect_dubins("random", "me/other", tmp_path / "other", n_episodes=14, seed=4)

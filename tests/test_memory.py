@@ -3,11 +3,11 @@ import resource
 import pytest
 import torch
 
-from lerobot_latentsafe import memory
+from lerobot_latentsafe.runtime import malloc
 
 
 def test_freed_activations_are_reused_not_faulted_in_again():
-    if not memory.keep_freed_memory():
+    if not malloc.keep_freed_memory():
         pytest.skip("this C library has no mallopt")
     faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt  # noqa: E731
     each = []
@@ -19,5 +19,5 @@ def test_freed_activations_are_reused_not_faulted_in_again():
 
 
 def test_a_c_library_without_the_setting_is_left_alone(monkeypatch):
-    monkeypatch.setattr(memory.ctypes, "CDLL", lambda name: object())
-    assert memory.keep_freed_memory.__wrapped__() is False
+    monkeypatch.setattr(malloc.ctypes, "CDLL", lambda name: object())
+    assert malloc.keep_freed_memory.__wrapped__() is False

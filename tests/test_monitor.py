@@ -5,9 +5,10 @@ import pytest
 import tiny
 import torch
 
-from lerobot_latentsafe.envs import dubins
-from lerobot_latentsafe.evaluation.ground_truth import exact_value
-from lerobot_latentsafe.evaluation.monitor import (
+from lerobot_latentsafe.dubins import car
+from lerobot_latentsafe.dubins.ground_truth import exact_value
+from lerobot_latentsafe.evaluation.statistics import confusion, provenance, wilson, write_json
+from lerobot_latentsafe.experiments.dubins.monitor import (
     LatentMonitor,
     PlanMonitor,
     boundary_starts,
@@ -15,7 +16,6 @@ from lerobot_latentsafe.evaluation.monitor import (
     feasible_starts,
     safe_policy_rollouts,
 )
-from lerobot_latentsafe.evaluation.rollouts import confusion, provenance, wilson, write_json
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, UntrainedFilterError
 
 STATES = np.random.default_rng(0).uniform([-1.1, -1.1, -np.pi], [1.1, 1.1, np.pi], (20, 3))
@@ -29,8 +29,8 @@ class ExactMonitor:
 
     def start(self):
         def act(states):
-            after = [exact_value(dubins.step(states, np.full(len(states), u))) for u in dubins.TURN_RATES]
-            return dubins.TURN_RATES[np.argmax(after, 0)]
+            after = [exact_value(car.step(states, np.full(len(states), u))) for u in car.TURN_RATES]
+            return car.TURN_RATES[np.argmax(after, 0)]
 
         return act
 
@@ -153,8 +153,8 @@ def test_learned_monitors_run(latent, kind):
     assert value.shape == (20,) and np.isfinite(value).all() and np.ptp(value) > 0
     assert (value <= latent.margin(STATES) + 1e-6).all()
     act = monitor.start()
-    for states in (STATES, dubins.step(STATES, np.zeros(20))):
-        assert set(np.round(act(states), 4)) <= set(dubins.TURN_RATES)
+    for states in (STATES, car.step(STATES, np.zeros(20))):
+        assert set(np.round(act(states), 4)) <= set(car.TURN_RATES)
 
 
 def test_value_does_not_depend_on_the_chunk(latent):
@@ -188,7 +188,7 @@ def test_monitor_sees_what_the_shield_sees(latent):
     policy = latent.policy
     heading = STATES[:, 2]
     before = STATES.copy()
-    before[:, :2] -= dubins.DT * np.stack([np.cos(heading), np.sin(heading)], -1)
+    before[:, :2] -= car.DT * np.stack([np.cos(heading), np.sin(heading)], -1)
     policy.config.epsilon, policy.config.mode = 0.0, "monitor"
     policy.reset()
     straight = policy.hold_action(20)
@@ -200,7 +200,7 @@ def test_monitor_sees_what_the_shield_sees(latent):
 
 
 def test_value_slices_are_drawn(latent, tmp_path):
-    from lerobot_latentsafe.evaluation import figures
+    from lerobot_latentsafe.reports import figures
 
     figure = figures.value_slices({"latent": latent, "exact": ExactMonitor()}, n=9)
     assert len(figure.axes) == 8  # two headings and their colour bars, for each monitor

@@ -8,10 +8,11 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import OBS_ENV_STATE
 from safetensors.torch import load_file, save_file
 
-from lerobot_latentsafe import perceive
+from lerobot_latentsafe.base_policy import BasePolicy
 from lerobot_latentsafe.datasets.frame_cache import FrameCache, FrameCacheError
-from lerobot_latentsafe.envs.dubins import ACTION_NAMES, STATE_NAMES
-from lerobot_latentsafe.perceive import (
+from lerobot_latentsafe.dubins.car import ACTION_NAMES, STATE_NAMES
+from lerobot_latentsafe.policies import grasp_prediction
+from lerobot_latentsafe.policies.grasp_prediction import (
     AIM,
     Aim,
     PerceiveStep,
@@ -22,7 +23,6 @@ from lerobot_latentsafe.perceive import (
     until_switched,
     with_aim,
 )
-from lerobot_latentsafe.shield import BasePolicy
 
 REPO_ID = tiny.REPO_ID + "_cache"
 AIMED = {"switch": ACTION_NAMES[0], "moved": STATE_NAMES}
@@ -32,7 +32,7 @@ AIMED = {"switch": ACTION_NAMES[0], "moved": STATE_NAMES}
 @pytest.fixture(scope="module", autouse=True)
 def few_steps():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(perceive, "STEPS", 20)
+        patch.setattr(grasp_prediction, "STEPS", 20)
         yield
 
 
@@ -81,7 +81,7 @@ def test_what_is_learnt_of_an_object_in_some_places_holds_in_others():
     torch.manual_seed(0)
     aim, state = Aim(1, 36, 4, state_dim=1, n_moves=2), torch.zeros(36, 1)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(perceive, "STEPS", 400)
+        patch.setattr(grasp_prediction, "STEPS", 400)
         aim.fit(tokens[shown], state[shown], places[shown])
     unseen = torch.from_numpy(np.setdiff1d(patches, shown))
     error = (aim(tokens[unseen], state[unseen]) - places[unseen]).norm(dim=-1)
@@ -104,9 +104,9 @@ def test_a_policy_learns_from_aims_of_a_network_that_did_not_learn_from_them(see
     dataset, cache = LeRobotDataset(f"{REPO_ID}_seen", root=seen.root), FrameCache.open(token_root)
     percepts, state = cache.frames(np.arange(len(dataset)), ["tokens"])
     aim = Aim(1, *percepts["tokens"].shape[1:], state.shape[1], n_moves=2)
-    aim.load_state_dict(load_file(seen.root / perceive.AIM))
+    aim.load_state_dict(load_file(seen.root / grasp_prediction.AIM))
     column = torch.from_numpy(np.stack(dataset.hf_dataset.with_format("numpy")[OBS_ENV_STATE]))
-    by_one_that_did = aim.in_detail(perceive.foreseen(aim.eval(), percepts["tokens"], state))
+    by_one_that_did = aim.in_detail(grasp_prediction.foreseen(aim.eval(), percepts["tokens"], state))
     assert column.shape == by_one_that_did.shape
     assert not torch.isclose(column, by_one_that_did, rtol=1e-2).all(1).any()
 

@@ -115,6 +115,6 @@ def test_importing_the_package_loads_nothing_heavy(discovered):
     heavy = {
         "mujoco", "mink", "franky", "matplotlib", "scipy", "jax", "hj_reachability", "transformers", "datasets",
         "pandas",
-        "lerobot_latentsafe.modeling_latentsafe", "lerobot_latentsafe.envs.dubins", "lerobot_latentsafe.commands",
+        "lerobot_latentsafe.modeling_latentsafe", "lerobot_latentsafe.dubins.car", "lerobot_latentsafe.commands",
     }  # fmt: skip
     assert heavy.isdisjoint(discovered["loaded"])

@@ -12,11 +12,12 @@ from lerobot.policies.factory import make_policy, make_pre_post_processors
 from safetensors.torch import load_file, save_file
 
 from lerobot_latentsafe import LatentSafeConfig, LatentSafeDubinsEnv
-from lerobot_latentsafe.checkpoint import CheckpointError, resolve_checkpoint, seal
-from lerobot_latentsafe.filter import Reason
-from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, UntrainedFilterError, adopt_dataset
-from lerobot_latentsafe.shield import BasePolicy
-from lerobot_latentsafe.training import save_filter, train_reachability
+from lerobot_latentsafe.base_policy import BasePolicy
+from lerobot_latentsafe.decision import Reason
+from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, UntrainedFilterError
+from lerobot_latentsafe.runtime.checkpoint import CheckpointError, resolve_checkpoint, save_filter, seal
+from lerobot_latentsafe.training import train_reachability
+from lerobot_latentsafe.units import adopt_dataset
 
 load = LatentSafePolicy.from_pretrained
 
@@ -153,7 +154,7 @@ def test_no_path_at_all_asks_for_one():
 
 
 def test_names_resolve_to_committed_folders(tmp_path, monkeypatch):
-    monkeypatch.setattr("lerobot_latentsafe.checkpoint.PRETRAINED", tmp_path)
+    monkeypatch.setattr("lerobot_latentsafe.runtime.checkpoint.PRETRAINED", tmp_path)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "config.json").write_text("{}")
     assert resolve_checkpoint("mine") == tmp_path / "mine"

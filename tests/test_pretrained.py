@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from lerobot_latentsafe.checkpoint import PRETRAINED, check_sealed, committed_names
-from lerobot_latentsafe.evaluation.ground_truth import exact_value
-from lerobot_latentsafe.evaluation.monitor import LatentMonitor
-from lerobot_latentsafe.evaluation.rollouts import confusion
+from lerobot_latentsafe.base_policy import BasePolicy
+from lerobot_latentsafe.dubins.ground_truth import exact_value
+from lerobot_latentsafe.evaluation.statistics import confusion
+from lerobot_latentsafe.experiments.dubins.monitor import LatentMonitor
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
-from lerobot_latentsafe.shield import BasePolicy
+from lerobot_latentsafe.runtime.checkpoint import PRETRAINED, check_sealed, committed_names
 
 
 def size_of(name):
@@ -57,7 +57,7 @@ def test_filter_knows_the_safe_set(states):
 
 def test_filter_shields_the_committed_diffusion_policy():
     from lerobot_latentsafe import LatentSafeDubinsEnv
-    from lerobot_latentsafe.evaluation.shielding import compare
+    from lerobot_latentsafe.evaluation.statistics import compare
 
     policy = LatentSafePolicy.from_pretrained("dubins")
     policy.attach("dubins_diffusion_reckless")
@@ -67,9 +67,9 @@ def test_filter_shields_the_committed_diffusion_policy():
 
 
 def test_filter_keeps_the_candies_in_the_bag_that_an_operator_pulls_up_by_its_closed_end():
-    from lerobot_latentsafe.envs.bag import BagScene
-    from lerobot_latentsafe.evaluation.bag import drive
-    from lerobot_latentsafe.teleoperators.scripted.behaviors import begin
+    from lerobot_latentsafe.experiments.bag.runs import drive
+    from lerobot_latentsafe.franka.bag import BagScene
+    from lerobot_latentsafe.franka.behaviors import begin
 
     scene, policy = BagScene(), LatentSafePolicy.from_pretrained("bag").eval()
     lost = {}
@@ -83,7 +83,7 @@ def test_filter_keeps_the_candies_in_the_bag_that_an_operator_pulls_up_by_its_cl
 
 
 def test_task_policy_of_the_blocks_topples_less_under_the_filter_whose_world_model_it_shares():
-    from lerobot_latentsafe.evaluation.blocks_study import run, world_model_of
+    from lerobot_latentsafe.experiments.blocks.study import run, world_model_of
 
     assert world_model_of("blocks_dreamer") == "blocks"
     toppled = {}

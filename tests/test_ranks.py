@@ -14,9 +14,9 @@ from safetensors.torch import load_file
 from test_train import lerobot_train
 from torch.nn.parallel import DistributedDataParallel
 
-from lerobot_latentsafe import ranks
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.reachability import LatentReachability
+from lerobot_latentsafe.runtime import distributed
 from lerobot_latentsafe.training import encoded_starts, train_reachability
 
 WORLD_MODELS = {"rssm": tiny.rssm_config, "gru": tiny.gru_config, "dino_wm": tiny.dino_wm_config}
@@ -25,11 +25,11 @@ ACTIONS = {"discrete": tiny.CANDIDATES, "continuous": None}
 
 def train_world_model(root, name):
     """Losses and weights of three steps on windows of which the last half, the second rank's, run past their ends."""
-    torch.manual_seed(ranks.rank())  # weights that differ, until the first rank's are taken over
+    torch.manual_seed(distributed.rank())  # weights that differ, until the first rank's are taken over
     meta = tiny.metadata(root)
     policy = tiny.new_policy(meta, world_model=WORLD_MODELS[name]()).train()
     model = policy
-    if ranks.world_size() > 1:  # as accelerate does for lerobot-train
+    if distributed.world_size() > 1:  # as accelerate does for lerobot-train
         model = DistributedDataParallel(policy, find_unused_parameters=True)
     optimizer = torch.optim.SGD(policy.get_optim_params(), 1e-2)
     torch.manual_seed(1)
@@ -37,12 +37,12 @@ def train_world_model(root, name):
     ends = torch.as_tensor(meta.episodes["dataset_to_index"])[:8] - 3
     losses = []
     for step in range(3):
-        loss, metrics = model({"index": ranks.share(torch.cat([whole + step, ends + step]))})
+        loss, metrics = model({"index": distributed.share(torch.cat([whole + step, ends + step]))})
         optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(policy.get_optim_params(), 1.0)
         optimizer.step()
-        losses.append(ranks.mean_over_ranks(torch.tensor([loss.item(), metrics["loss_margin"]])))
+        losses.append(distributed.mean_over_ranks(torch.tensor([loss.item(), metrics["loss_margin"]])))
     assert policy.config.stage == "world_model"
     weights = {name: w for name, w in policy.state_dict().items() if not name.startswith("critic")}
     return {"losses": torch.stack(losses), **weights}
@@ -99,9 +99,9 @@ def test_two_ranks_train_what_one_does(one, two, name):
 
 def test_a_single_process_is_left_alone():
     x = torch.randn(3, 2)
-    assert ranks.world_size() == 1 and ranks.rank() == 0
-    assert ranks.mean_over_ranks(x) is x and ranks.gathered(x) is x
-    with ranks.joined():
+    assert distributed.world_size() == 1 and distributed.rank() == 0
+    assert distributed.mean_over_ranks(x) is x and distributed.gathered(x) is x
+    with distributed.joined():
         assert not dist.is_initialized()
 
 

@@ -7,19 +7,13 @@ import pytest
 import tiny
 import torch
 
-from lerobot_latentsafe.baselines.privileged import DubinsImagination, train_privileged
-from lerobot_latentsafe.envs import dubins
-from lerobot_latentsafe.evaluation.ground_truth import exact_value
-from lerobot_latentsafe.evaluation.monitor import PrivilegedMonitor
-from lerobot_latentsafe.evaluation.rollouts import confusion
-from lerobot_latentsafe.reachability import (
-    LatentReachability,
-    ReachabilityConfig,
-    SafetyCritic,
-    discount,
-    look_ahead,
-    safety_bellman_target,
-)
+from lerobot_latentsafe.critic import ReachabilityConfig, SafetyCritic, safety_bellman_target
+from lerobot_latentsafe.dubins import car
+from lerobot_latentsafe.dubins.ground_truth import exact_value
+from lerobot_latentsafe.evaluation.statistics import confusion
+from lerobot_latentsafe.experiments.dubins.monitor import PrivilegedMonitor
+from lerobot_latentsafe.experiments.dubins.privileged import DubinsImagination, train_privileged
+from lerobot_latentsafe.reachability import LatentReachability, discount, look_ahead
 
 MARGIN, NEXT = torch.tensor([0.5, 0.5, -0.2]), torch.tensor([0.1, 0.9, 0.3])
 
@@ -300,9 +294,9 @@ def test_divergence_is_noticed():
 def test_privileged_imagination_is_the_car():
     states = torch.tensor([[0.1, -0.2, 0.4], [0.8, 0.9, -2.0]])
     after = DubinsImagination().step({"state": states}, torch.tensor([[1.0], [-0.4]]))["state"]
-    expected = dubins.step(states.numpy().astype(float), np.array([1.25, -0.5]))
+    expected = car.step(states.numpy().astype(float), np.array([1.25, -0.5]))
     np.testing.assert_allclose(after, expected, atol=1e-6)
-    np.testing.assert_allclose(DubinsImagination().margin({"state": states}), dubins.margin(states.numpy()), atol=1e-6)
+    np.testing.assert_allclose(DubinsImagination().margin({"state": states}), car.margin(states.numpy()), atol=1e-6)
 
 
 def test_a_short_privileged_run_is_far_better_than_always_safe():
@@ -316,5 +310,5 @@ def test_a_short_privileged_run_is_far_better_than_always_safe():
     learned = confusion(monitor.value(states) > 0, truth)["balanced_accuracy"]
     assert confusion(np.ones(3000, bool), truth)["balanced_accuracy"] == pytest.approx(0.5)
     assert learned > 0.85
-    margin_alone = confusion(dubins.margin(states) > 0, truth)["balanced_accuracy"]
+    margin_alone = confusion(car.margin(states) > 0, truth)["balanced_accuracy"]
     assert learned > margin_alone

@@ -7,11 +7,11 @@ import tiny
 import torch
 
 from lerobot_latentsafe import LatentSafeBagEnv, LatentSafeBlocksEnv
+from lerobot_latentsafe.base_policy import BasePolicy
 from lerobot_latentsafe.cli import main
-from lerobot_latentsafe.evaluation import report
-from lerobot_latentsafe.evaluation.filter_report import write_filter_report
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
-from lerobot_latentsafe.shield import BasePolicy
+from lerobot_latentsafe.reports import html
+from lerobot_latentsafe.reports.filter_report import write_filter_report
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ def test_report_on_the_blocks_draws_what_was_imagined(tmp_path):
 
 
 def test_text_is_escaped():
-    assert "<b>" not in report.heading("<b>") + report.table(["<b>"], [["<b>"]]) + report.chart({"<b>": np.ones(3)}, 10)
+    assert "<b>" not in html.heading("<b>") + html.table(["<b>"], [["<b>"]]) + html.chart({"<b>": np.ones(3)}, 10)
 
 
 def test_frames_of_a_video_stand_for_it_on_paper(tmp_path):
@@ -95,13 +95,13 @@ def test_frames_of_a_video_stand_for_it_on_paper(tmp_path):
 
     grey = [np.full((32, 48, 3), level, np.uint8) for level in range(0, 200, 20)]
     write_video(str(tmp_path / "run.mp4"), grey, 5)
-    shown = report.video(tmp_path / "run.mp4", "a run")
+    shown = html.video(tmp_path / "run.mp4", "a run")
     assert re.findall(r"<figcaption>(.*?)</figcaption>", shown) == ["0.0 s", "0.6 s", "1.2 s", "1.8 s", "a run"]
-    assert len(set(re.findall(r'<img alt="" src="(.*?)"', shown))) == report.PRINTED
+    assert len(set(re.findall(r'<img alt="" src="(.*?)"', shown))) == html.PRINTED
 
 
 def test_chart_leaves_gaps_and_shades_what_is_asked():
-    svg = report.chart({"V": np.array([0.0, np.nan, 1.0])}, 10, np.array([False, True, True]), level=0.5)
+    svg = html.chart({"V": np.array([0.0, np.nan, 1.0])}, 10, np.array([False, True, True]), level=0.5)
     assert svg.count("<rect") == 2 and "nan" not in svg and "stroke-dasharray" in svg
 
 

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from lerobot_latentsafe.evaluation import rollouts
-from lerobot_latentsafe.evaluation.rollouts import paired_p_value, run_resumable, write_json
+from lerobot_latentsafe.evaluation import statistics
+from lerobot_latentsafe.evaluation.statistics import paired_p_value, run_resumable, write_json
 
 JOBS = [{"seed": seed, "filter": None} for seed in (3, 1, 2)]
 
@@ -48,7 +48,7 @@ def test_a_run_of_other_weights_is_not_taken_for_its_own(tmp_path):
 
 def test_workers_share_the_runs(tmp_path, monkeypatch):
     """Threads here: starting processes takes longer than all other tests of this file."""
-    monkeypatch.setattr(rollouts, "get_context", lambda method: SimpleNamespace(Pool=ThreadPool))
+    monkeypatch.setattr(statistics, "get_context", lambda method: SimpleNamespace(Pool=ThreadPool))
     rows = run_resumable(tmp_path / "runs.jsonl", JOBS, square, workers=2)
     assert lost(rows) == [9, 1, 4] and all(row["cpu_s"] >= 0 for row in rows)
 

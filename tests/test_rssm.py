@@ -2,7 +2,7 @@ import pytest
 import tiny
 import torch
 
-from lerobot_latentsafe.world_models.base import map_latent
+from lerobot_latentsafe.latent import map_latent
 
 KEY = "observation.image"
 

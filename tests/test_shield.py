@@ -5,9 +5,9 @@ import pytest
 import tiny
 import torch
 
-from lerobot_latentsafe.filter import Reason
+from lerobot_latentsafe.datasets.clips import Clip
+from lerobot_latentsafe.decision import Reason
 from lerobot_latentsafe.shield import Shield
-from lerobot_latentsafe.world_models import Clip
 
 IMAGE = "observation.image"
 STATES = ((-0.9, 0.1, 0.0), (-0.7, -0.3, 0.5), (0.6, 0.6, 2.0))
@@ -475,8 +475,8 @@ def test_fallback_keeps_its_grip(cache_meta, tmp_path):
 
 def test_before_anything_was_executed_the_grip_is_that_which_is_seen(tmp_path):
     """A kept command whose name the state has, in the same unit."""
+    from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES
     from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
-    from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, STATE_NAMES
 
     policy = LatentSafePolicy.from_pretrained(tiny.save_franka_filter(tmp_path / "filter", epsilon=2.0))
     assert "gripper.pos" in STATE_NAMES

@@ -13,8 +13,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.robots.utils import make_robot_from_config
 
 from lerobot_latentsafe import cli
-from lerobot_latentsafe.filter import Reason
-from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, STATE_NAMES
+from lerobot_latentsafe.decision import Reason
+from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES
 from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
 from lerobot_latentsafe.robots.shielded.config_shielded import LatentSafeShieldedConfig
 
@@ -372,9 +372,9 @@ def test_lerobots_own_commands_take_the_shielded_robot(trained, tmp_path, monkey
 def test_a_journal_goes_on_and_forgets_what_is_recorded_again(tmp_path):
     import pyarrow.parquet as pq
 
-    from lerobot_latentsafe.filter import least_restrictive
-    from lerobot_latentsafe.robots.announcements import RESETTING
-    from lerobot_latentsafe.robots.shielded.journal import Journal
+    from lerobot_latentsafe.datasets.decisions import Journal
+    from lerobot_latentsafe.decision import least_restrictive
+    from lerobot_latentsafe.robots.lerobot_events import RESETTING
 
     def note(journal, announced, values):
         journal.hear(announced)
@@ -405,8 +405,8 @@ def frames_of(*actions):
 
 
 def test_decisions_of_another_dataset_are_refused(tmp_path):
-    from lerobot_latentsafe.filter import least_restrictive
-    from lerobot_latentsafe.robots.shielded.journal import Journal, decision_columns
+    from lerobot_latentsafe.datasets.decisions import Journal, decision_columns
+    from lerobot_latentsafe.decision import least_restrictive
 
     with pytest.raises(FileNotFoundError, match="latentsafe record"):
         decision_columns(tmp_path / "none.parquet", frames_of([0.0, 1.0]))

@@ -7,8 +7,8 @@ import tiny
 from lerobot.configs.types import FeatureType, PolicyFeature
 
 from lerobot_latentsafe import LatentSafeDubinsEnv
-from lerobot_latentsafe.evaluation.shielding import Episodes, check_environment, compare, run_episodes
-from lerobot_latentsafe.filter import Reason
+from lerobot_latentsafe.decision import Reason
+from lerobot_latentsafe.evaluation.statistics import Episodes, check_environment, compare, run_episodes
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 
 N, LENGTH = 4, 12
@@ -118,7 +118,7 @@ def test_a_violation_counts_even_when_the_goal_is_reached(shielded, monkeypatch)
     """Straight through the disc, and on to the right edge."""
     straight = shielded.hold_action(1)
     monkeypatch.setattr(shielded.base, "propose", lambda _: straight)
-    monkeypatch.setattr("lerobot_latentsafe.envs.dubins.sample_task_start", lambda _: np.array([-0.9, 0.0, 0.0]))
+    monkeypatch.setattr("lerobot_latentsafe.dubins.car.sample_task_start", lambda _: np.array([-0.9, 0.0, 0.0]))
     episodes = run_episodes(shielded.base, car(episode_length=80), 1, seed=0)
     assert episodes.violation.all() and not episodes.success.any()
     assert episodes.traces[0]["state"][-1][0] > 0.899
@@ -149,7 +149,7 @@ def test_nothing_to_shield_is_refused(policy):
 
 
 def test_figures_and_videos_are_written(result, tmp_path):
-    from lerobot_latentsafe.evaluation import figures
+    from lerobot_latentsafe.reports import figures
 
     episodes = result["episodes"]
     figures.save(figures.trajectories(episodes), tmp_path / "new" / "trajectories.png")

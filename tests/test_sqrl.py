@@ -9,8 +9,9 @@ import torch
 from test_reachability import CHAIN, WindyChain
 
 from lerobot_latentsafe.configuration_latentsafe import CriticTargetError
+from lerobot_latentsafe.critic import SafetyCritic, risk_bellman_target
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
-from lerobot_latentsafe.reachability import LatentReachability, SafetyCritic, risk_bellman_target
+from lerobot_latentsafe.reachability import LatentReachability
 from lerobot_latentsafe.training import train_reachability
 
 
@@ -111,7 +112,7 @@ def test_baselines_without_a_critic_go_with_either(risk_filter):
 def test_target_edited_by_hand_is_refused(risk_filter, tmp_path):
     import shutil
 
-    from lerobot_latentsafe.checkpoint import CheckpointError
+    from lerobot_latentsafe.runtime.checkpoint import CheckpointError
 
     copy = shutil.copytree(risk_filter, tmp_path / "copy")
     tiny.rewrite_json(copy / "config.json", target="reachability", law="reachability")

@@ -7,11 +7,12 @@ import pytest
 import tiny
 
 from lerobot_latentsafe.cli import main
+from lerobot_latentsafe.datasets.episodes import DatasetFrames
+from lerobot_latentsafe.evaluation.along_episodes import episode_margins
 from lerobot_latentsafe.labeling import suggestions
 from lerobot_latentsafe.labeling.disagreements import find_disagreements
-from lerobot_latentsafe.labeling.frames import DatasetFrames
 from lerobot_latentsafe.labeling.store import LabelStore
-from lerobot_latentsafe.labeling.suggestions import Suggester, Suggestion, best_split, contradiction, episode_margins
+from lerobot_latentsafe.labeling.suggestions import Suggester, Suggestion, best_split, contradiction
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot_latentsafe.datasets import build_cache
 from lerobot_latentsafe.datasets.build_cache import build_frame_cache
 from lerobot_latentsafe.datasets.frame_cache import FrameCache, FrameCacheError, to_model_images
-from lerobot_latentsafe.world_models.encoders import EncoderError
+from lerobot_latentsafe.encoders.patch_encoders import EncoderError
 
 
 @pytest.fixture(scope="module")

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import tiny
 import torch
-
 from lerobot_latentsafe.commands import EvalWorldModel, PolicySource
+
 from lerobot_latentsafe.evaluation import world_model as questions
 from lerobot_latentsafe.evaluation.world_model import balanced_accuracy, evaluate_world_model
 

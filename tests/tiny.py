@@ -11,9 +11,10 @@ import pytest
 import torch
 
 from lerobot_latentsafe import LatentSafeConfig
-from lerobot_latentsafe.envs import dubins
-from lerobot_latentsafe.reachability import ReachabilityConfig
-from lerobot_latentsafe.world_models import Clip, RSSMConfig
+from lerobot_latentsafe.critic import ReachabilityConfig
+from lerobot_latentsafe.datasets.clips import Clip
+from lerobot_latentsafe.dubins import car
+from lerobot_latentsafe.world_models import RSSMConfig
 
 REPO_ID = "me/car"
 ACTION_DIM = 2
@@ -40,15 +41,15 @@ def tokens(**changes):
     from functools import partial
 
     from lerobot_latentsafe.datasets.build_cache import Tokens
-    from lerobot_latentsafe.world_models.perception import PerceptionConfig
+    from lerobot_latentsafe.encoders.perception import PerceptionConfig
 
     perception = PerceptionConfig(encoder="efficientnet_lite0", components=COMPONENTS)
     return partial(Tokens, **{"config": perception, **changes})
 
 
 def gru_config(**changes):
+    from lerobot_latentsafe.encoders.perception import PerceptionConfig
     from lerobot_latentsafe.world_models import GRUConfig
-    from lerobot_latentsafe.world_models.perception import PerceptionConfig
 
     perception = PerceptionConfig(encoder="efficientnet_lite0", components=COMPONENTS)
     sizes = dict(perception=perception, image_size=TOKEN_SIZE, hidden=16, units=16, clip_length=8, observed=3)
@@ -56,8 +57,8 @@ def gru_config(**changes):
 
 
 def dino_wm_config(**changes):
+    from lerobot_latentsafe.encoders.perception import PerceptionConfig
     from lerobot_latentsafe.world_models import DinoWMConfig
-    from lerobot_latentsafe.world_models.perception import PerceptionConfig
 
     perception = PerceptionConfig(encoder="efficientnet_lite0", components=COMPONENTS)
     sizes = dict(
@@ -104,7 +105,7 @@ def new_policy(meta, **changes):
 
 def train_stage_one(meta, folder, steps=5, **changes):
     """A few gradient steps on world model and margin, then save as lerobot-train does."""
-    from lerobot_latentsafe.training import save_filter
+    from lerobot_latentsafe.runtime.checkpoint import save_filter
 
     torch.manual_seed(0)
     policy = new_policy(meta, **changes).train()
@@ -122,10 +123,10 @@ def save_franka_filter(folder, scene="blocks", **changes):
     """A filter of the simulated Franka's two cameras with random weights, saved as if it were trained."""
     from lerobot.configs.types import FeatureType, PolicyFeature
 
-    from lerobot_latentsafe.envs.scenes import SCENES
+    from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES, action_limits
+    from lerobot_latentsafe.franka.scenes import SCENES
     from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
-    from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, STATE_NAMES, action_limits
-    from lerobot_latentsafe.training import save_filter
+    from lerobot_latentsafe.runtime.checkpoint import save_filter
 
     torch.manual_seed(0)
     cameras = [f"observation.images.{name}" for name in ("front", "wrist")]
@@ -178,7 +179,7 @@ def save_diffusion(folder, action_dim=ACTION_DIM):
 
 def observation(states):
     """LeRobot batch that the car's environment gives in states (N, 3)."""
-    seen = dubins.observe(np.atleast_2d(np.asarray(states, float)), dubins.Renderer())
+    seen = car.observe(np.atleast_2d(np.asarray(states, float)), car.Renderer())
     return {
         "observation.image": torch.from_numpy(seen["image"]).permute(0, 3, 1, 2) / 255.0,
         "observation.state": torch.from_numpy(seen["heading"]),
@@ -193,7 +194,7 @@ def drive(policy, n_steps=6, start=((-0.9, 0.1, 0.0), (-0.7, -0.3, 0.5))):
     decisions = []
     for t in range(n_steps):
         decisions.append(policy.decide(observation(states)))
-        states = dubins.step(states, np.full(len(states), 0.5 * (-1) ** t))
+        states = car.step(states, np.full(len(states), 0.5 * (-1) ** t))
     return decisions
 
 
@@ -229,8 +230,8 @@ BLOCKS_FRAMES = 12
 @contextmanager
 def short_blocks():
     """Meanwhile episodes of the blocks have 12 frames, and the red blocks seem to fall after a quarter of a second."""
-    from lerobot_latentsafe.envs import blocks
-    from lerobot_latentsafe.envs.scenes import SCENES
+    from lerobot_latentsafe.franka import blocks
+    from lerobot_latentsafe.franka.scenes import SCENES
 
     info = dataclasses.replace(SCENES["blocks"], episode_seconds=BLOCKS_FRAMES / SCENES["blocks"].fps)
     with pytest.MonkeyPatch.context() as patch:
@@ -242,8 +243,8 @@ def short_blocks():
 def dreamer_options(output_dir, **changes):
     """A run of `latentsafe train-dreamer` in seconds: two demonstrations, two rounds of two episodes."""
     from lerobot_latentsafe import LatentSafeDreamerConfig
-    from lerobot_latentsafe.baselines.dreamer.behavior import BehaviorConfig
-    from lerobot_latentsafe.baselines.dreamer.training import TrainDreamer
+    from lerobot_latentsafe.experiments.blocks.dreamer_training import TrainDreamer
+    from lerobot_latentsafe.policies.dreamer.behavior import BehaviorConfig
 
     behavior = BehaviorConfig(hidden=16, bins=17, horizon=3, starts=8)
     model = config(

@@ -27,14 +27,14 @@ from lerobot_latentsafe.datasets.frame_cache import (
     dataset_fingerprint,
     to_model_images,
 )
-from lerobot_latentsafe.memory import keep_freed_memory
+from lerobot_latentsafe.runtime.malloc import keep_freed_memory
 
 if TYPE_CHECKING:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    from lerobot_latentsafe.labeling.frames import DatasetFrames
-    from lerobot_latentsafe.world_models.perception import PerceptionConfig
+    from lerobot_latentsafe.datasets.episodes import DatasetFrames
+    from lerobot_latentsafe.encoders.perception import PerceptionConfig
 
 LAYOUT, DONE = "layout.json", "done.npy"
 ENCODED_AT_ONCE = 8
@@ -91,7 +91,7 @@ class Tokens:
         self, cameras: list[str], image_size: int, config: "PerceptionConfig", dtype: str = "float16",
         basis_from: str | Path | None = None,
     ):  # fmt: skip
-        from lerobot_latentsafe.world_models.perception import Perception
+        from lerobot_latentsafe.encoders.perception import Perception
 
         if dtype not in ("float16", "int8"):
             raise ValueError(f"--dtype is {dtype!r}; expected float16 or int8")
@@ -186,7 +186,7 @@ def build_frame_cache(
     """
     from tqdm import tqdm
 
-    from lerobot_latentsafe.labeling.frames import DatasetFrames
+    from lerobot_latentsafe.datasets.episodes import DatasetFrames
 
     output_dir, folder = Path(output_dir), Path(output_dir) / FOLDER
     if not dataset.meta.camera_keys:

@@ -140,6 +140,18 @@ class FrameCache:
     def image_size(self) -> int:
         return self.manifest["image_size"]
 
+    def require_image_size(self, size: int) -> None:
+        """Refuse pictures of another size than a world model reads.
+
+        Raises:
+            FrameCacheError: naming both, and the command that builds another.
+        """
+        if self.image_size != size:
+            raise FrameCacheError(
+                f"this cache holds {self.image_size}-pixel frames, the world model reads {size}; build it with "
+                f"latentsafe cache --image_size={size}"
+            )
+
     def frames(self, index: np.ndarray, names: list[str] | None = None) -> tuple[dict[str, Tensor], Tensor]:
         """Percepts, pictures in [0, 1], and proprioception at frame indices of any shape (...).
 
@@ -155,6 +167,11 @@ class FrameCache:
         if name in self.scales:
             return numbers.float() * torch.from_numpy(self.scales[name][index]).float()
         return numbers.float()
+
+
+def basis_file(root: str | Path) -> Path:
+    """Where the principal components of a token cache lie, in the folder of its dataset."""
+    return Path(root) / FOLDER / BASIS
 
 
 def scale_file(folder: Path, name: str) -> Path:

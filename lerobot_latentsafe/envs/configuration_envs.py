@@ -7,8 +7,8 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGE, OBS_IMAGES, OBS_STATE
 
-from lerobot_latentsafe.envs.scenes import SCENES, check_scene
-from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, STATE_NAMES
+from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES
+from lerobot_latentsafe.franka.scenes import SCENES, check_scene
 
 
 @EnvConfig.register_subclass("latentsafe_dubins")
@@ -138,6 +138,6 @@ def _register(gym_id: str, entry_point: str) -> None:
         gym.register(gym_id, entry_point=entry_point, disable_env_checker=True)
 
 
-_register("lerobot_latentsafe/Dubins-v0", "lerobot_latentsafe.envs.dubins:DubinsEnv")
+_register("lerobot_latentsafe/Dubins-v0", "lerobot_latentsafe.dubins.car:DubinsEnv")
 _register("lerobot_latentsafe/Bag-v0", "lerobot_latentsafe.envs.franka_env:BagEnv")
 _register("lerobot_latentsafe/Blocks-v0", "lerobot_latentsafe.envs.franka_env:BlocksEnv")

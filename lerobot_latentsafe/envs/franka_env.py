@@ -5,9 +5,9 @@ from typing import ClassVar
 import gymnasium as gym
 import numpy as np
 
-from lerobot_latentsafe.envs.franka import CAMERAS
-from lerobot_latentsafe.envs.scenes import SCENES, make_scene
-from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, STATE_NAMES, action_limits
+from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES, action_limits
+from lerobot_latentsafe.franka.scene import CAMERAS
+from lerobot_latentsafe.franka.scenes import SCENES, make_scene
 
 
 class FrankaEnv(gym.Env):

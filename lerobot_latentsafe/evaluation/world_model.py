@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_latentsafe.datasets.clips import ClipReader
+from lerobot_latentsafe.datasets.clips import Clip, ClipReader
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE
-from lerobot_latentsafe.evaluation.rollouts import wilson
+from lerobot_latentsafe.evaluation.statistics import wilson
+from lerobot_latentsafe.latent import Belief, Latent, select
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
-from lerobot_latentsafe.world_models.base import Belief, Clip, Latent, select
 
 HORIZONS = (1, 5, 10)
 OBSERVED = 4

@@ -21,7 +21,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route
 
-from lerobot_latentsafe.labeling.frames import DatasetFrames
+from lerobot_latentsafe.datasets.episodes import DatasetFrames
 from lerobot_latentsafe.labeling.store import ConflictError, LabelStore
 from lerobot_latentsafe.labeling.suggestions import Suggester, contradiction
 

@@ -16,8 +16,8 @@ from typing import Protocol
 import cv2
 import numpy as np
 
+from lerobot_latentsafe.datasets.episodes import DatasetFrames
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE, UNLABELLED
-from lerobot_latentsafe.labeling.frames import DatasetFrames
 from lerobot_latentsafe.labeling.store import LabelStore
 
 
@@ -53,10 +53,10 @@ Labeller = Callable[[Episode], "int | np.ndarray | None"]
 
 def dubins_truth(episode: Episode) -> np.ndarray:
     """Privileged simulation truth: the car fails where its recorded position is inside the disc."""
-    from lerobot_latentsafe.envs import dubins
+    from lerobot_latentsafe.dubins import car
 
     position = episode.column("observation.environment_state")
-    return np.where(np.hypot(*position.T) < dubins.RADIUS, FAILING, SAFE)
+    return np.where(np.hypot(*position.T) < car.RADIUS, FAILING, SAFE)
 
 
 # -- a vision-language model ---

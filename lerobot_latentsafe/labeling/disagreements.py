@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
+from lerobot_latentsafe.datasets.episodes import DatasetFrames
 from lerobot_latentsafe.datasets.labels import FAILING, UNLABELLED
-from lerobot_latentsafe.evaluation import report
-from lerobot_latentsafe.labeling.frames import DatasetFrames
 from lerobot_latentsafe.labeling.store import LabelStore
 from lerobot_latentsafe.labeling.suggestions import Suggestion, contradiction
+from lerobot_latentsafe.reports import html
 
 PICTURES = 9
 
@@ -50,7 +50,7 @@ def write_disagreements(
     """One page with the worst disagreements: both verdicts, the margin over time, and pictures."""
     labelled = sum((store.labels(specification, e) != UNLABELLED).any() for e in range(len(store)))
     parts = [
-        report.paragraph(
+        html.paragraph(
             f"{len(found)} of {labelled} labelled episodes of {store.repo_id} disagree with the filter about "
             f"{specification!r}. The worst come first; either the label slipped, or the filter has not understood. "
             "Blue: the filter's margin, below zero it sees a failure. Grey: the label, +1 safe, -1 failing. Shaded: "
@@ -63,12 +63,12 @@ def write_disagreements(
         picked = np.unique(np.linspace(0, n - 1, PICTURES).round().astype(int))
         images = frames.images(frames.cameras[0], d.episode)
         parts += [
-            report.heading(f"Episode {d.episode}"),
-            report.paragraph(
+            html.heading(f"Episode {d.episode}"),
+            html.paragraph(
                 f"{verdict.by or 'Somebody'}: {in_words(verdict.first, n)}. "
                 f"Filter: {in_words(Suggestion.of(d.margin).guess, n)}."
             ),
-            report.chart({"margin": d.margin, "label": said}, frames.meta.fps, said * d.margin < 0, 0.0, (-1.0, 1.0)),
-            report.strip([images[t] for t in picked], [f"frame {t}" for t in picked], [said[t] < 0 for t in picked]),
+            html.chart({"margin": d.margin, "label": said}, frames.meta.fps, said * d.margin < 0, 0.0, (-1.0, 1.0)),
+            html.strip([images[t] for t in picked], [f"frame {t}" for t in picked], [said[t] < 0 for t in picked]),
         ]
-    report.write_report(path, "Labels and filter disagree", parts)
+    html.write_report(path, "Labels and filter disagree", parts)

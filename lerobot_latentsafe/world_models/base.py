@@ -6,7 +6,6 @@ Within models actions are in [-1, 1] and images in [0, 1]; `action[t]` is the ac
 """
 
 import abc
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,47 +13,9 @@ import draccus
 import torch
 from torch import Tensor, nn
 
+from lerobot_latentsafe.datasets.clips import Clip
 from lerobot_latentsafe.datasets.frame_cache import FrameCacheError
-
-Latent = dict[str, Tensor]
-
-
-def map_latent(latent: Latent, function: Callable[..., Tensor], *others: Latent) -> Latent:
-    """Apply a function to each tensor of a latent (and to the same tensors of others)."""
-    return {key: function(value, *(other[key] for other in others)) for key, value in latent.items()}
-
-
-def select(latent: Latent, index: Tensor | slice) -> Latent:
-    """Rows of a batch of latents."""
-    return map_latent(latent, lambda t: t[index])
-
-
-def replace_rows(latent: Latent, new: Latent, where: Tensor) -> Latent:
-    """Rows of `new` where the mask (B,) holds, of `latent` elsewhere."""
-    return map_latent(latent, lambda a, b: torch.where(where.reshape(-1, *[1] * (a.ndim - 1)), b, a), new)
-
-
-@dataclass
-class Clip:
-    """A batch of aligned windows of episodes, what a world model trains on.
-
-    Attributes:
-        percepts: what `WorldModel.perceive` makes of each frame's images: name -> (B, T, ...).
-        state: (B, T, S) proprioception.
-        action: (B, T, A) in [-1, 1], the action that led to each frame; zero where is_first.
-        is_first: bool (B, T), frames with no past.
-        valid: bool (B, T), False for padding.
-        failure: (B, T), 1 failing, 0 safe, -1 unlabelled.
-        terminal: (B, T), 1 where the episode is over, 0 where it goes on, -1 unknown.
-    """
-
-    percepts: dict[str, Tensor]
-    state: Tensor
-    action: Tensor
-    is_first: Tensor
-    valid: Tensor
-    failure: Tensor
-    terminal: Tensor
+from lerobot_latentsafe.latent import Latent, replace_rows
 
 
 @dataclass
@@ -73,57 +34,28 @@ class WorldModelConfig(draccus.ChoiceRegistry, abc.ABC):
     def type(self) -> str:
         return self.get_choice_name(type(self))
 
-    def adopt_cache(self, manifest: dict) -> None:
-        """Check that a frame cache holds what this world model perceives; by default each camera's picture.
+    def of_cache(self, manifest: dict) -> "WorldModelConfig":
+        """This configuration with what a frame cache tells; by default a cache holds each camera's picture.
 
         Raises:
-            FrameCacheError: it holds something else.
+            FrameCacheError, EncoderMismatchError: it holds something else.
         """
         if "encoder_hash" in manifest:
             raise FrameCacheError(
                 f"this cache holds the tokens of {manifest['encoder']}, a {self.type} world model reads pictures; "
                 "build one with latentsafe cache --image_size=... and no encoder"
             )
+        return self
 
     @abc.abstractmethod
     def build(self, image_keys: list[str], state_dim: int, action_dim: int) -> "WorldModel":
         """The world model with fresh weights."""
 
 
-@dataclass(frozen=True)
-class Belief:
-    """What is believed of an episode so far.
-
-    Attributes:
-        latent: the posterior.
-        younger: where old frames are forgotten: one that knows the last frames only, and will take its place.
-        n_frames: seen so far.
-    """
-
-    latent: Latent | None = None
-    younger: Latent | None = None
-    n_frames: int = 0
-
-    def after(self, observe: Callable[[Latent | None], Latent], memory: int = 0) -> "Belief":
-        """One frame on.
-
-        Args:
-            observe: posterior, or None at the start -> that after the frame.
-            memory: frames to remember at most, and at least half as many; 0: all.
-        """
-        half = memory // 2
-        if not half:
-            latent, younger = observe(self.latent), None
-        elif self.n_frames % half == 0:
-            latent, younger = observe(self.younger), observe(None)
-        else:
-            latent, younger = observe(self.latent), observe(self.younger)
-        return Belief(latent, younger, self.n_frames + 1)
-
-
 class WorldModel(nn.Module, abc.ABC):
     """z_t ~ encoder(z_t | z_hat_t, o_t), z_hat_{t+1} ~ transition(z_t, a_t) (Section III)."""
 
+    config: WorldModelConfig
     feature_dim: int
     action_dim: int
     image_keys: list[str]
@@ -150,8 +82,8 @@ class WorldModel(nn.Module, abc.ABC):
         """Keys of what `perceive` returns."""
         return self.image_keys
 
-    def load_basis(self, cache: Path) -> None:
-        """Take over what a frame cache was made with beyond its frames, if anything."""
+    def load_basis(self, root: Path) -> None:
+        """Take over what the frame cache of a dataset was made with beyond its frames, if anything."""
 
     def perceive(self, images: dict[str, Tensor]) -> dict[str, Tensor]:
         """The part of seeing that is never trained, and that a cache can therefore keep: by default the images.

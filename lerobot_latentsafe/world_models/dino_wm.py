@@ -10,18 +10,21 @@ next hardly anything changes. So by default action and proprioception modulate e
 clip is imagined from its start (open loop), and what changes weighs more than what does not.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from lerobot_latentsafe.ranks import from_first_rank, mean_over_ranks
-from lerobot_latentsafe.world_models.base import Clip, Latent, WorldModelConfig
-from lerobot_latentsafe.world_models.ends import EndAware
+from lerobot_latentsafe.datasets.clips import Clip
+from lerobot_latentsafe.encoders.perception import Perception, PerceptionConfig
+from lerobot_latentsafe.latent import Latent
+from lerobot_latentsafe.runtime.distributed import from_first_rank, mean_over_ranks
+from lerobot_latentsafe.world_models.base import WorldModelConfig
 from lerobot_latentsafe.world_models.frame_transformer import FrameTransformer, Linear
-from lerobot_latentsafe.world_models.perception import PatchSummary, Perception, PerceptionConfig
+from lerobot_latentsafe.world_models.patch_summary import PatchSummary
+from lerobot_latentsafe.world_models.termination import TerminationHead
 
 CONDITIONINGS = ("adaln", "concat")
 MOST_WEIGHT = 5.0
@@ -67,8 +70,8 @@ class DinoWMConfig(WorldModelConfig):
     change_weight: float = 0.7
     blind: bool = False
 
-    def adopt_cache(self, manifest: dict) -> None:
-        self.perception.adopt_cache(manifest)
+    def of_cache(self, manifest: dict) -> "DinoWMConfig":
+        return replace(self, perception=self.perception.of_cache(manifest))
 
     def build(self, image_keys: list[str], state_dim: int, action_dim: int) -> "DinoWM":
         if not image_keys:
@@ -100,7 +103,7 @@ def _change_decoder(n_in: int, n_layers: int, n_out: int) -> nn.Sequential:
     return nn.Sequential(*layers, last)
 
 
-class DinoWM(EndAware):
+class DinoWM(TerminationHead):
     """See the module's text. A latent holds
 
         tokens (B, P, C), state (B, S)    of the frame, seen or imagined
@@ -120,7 +123,8 @@ class DinoWM(EndAware):
     ):  # fmt: skip
         super().__init__()
         _check(config)
-        self.config, self.image_keys, self.action_dim = config, sorted(image_keys), action_dim
+        self.config = config if perception is None else replace(config, perception=perception.config)
+        self.image_keys, self.action_dim = sorted(image_keys), action_dim
         self._perception = [perception]  # in a list, so that it is not part of the checkpoint
         d, width = config.dim, config.summary
         self._build_inputs(n_patches, token_dim, state_dim)

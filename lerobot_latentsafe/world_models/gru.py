@@ -9,15 +9,19 @@ Trained open loop: a few frames are observed, the rest of the clip is imagined u
 losses teach a model to copy the last frame and to ignore the action (see `evaluation/world_model.py`).
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
-from lerobot_latentsafe.ranks import mean_over_ranks
-from lerobot_latentsafe.world_models.base import Clip, Latent, WorldModel, WorldModelConfig, replace_rows
-from lerobot_latentsafe.world_models.perception import PatchSummary, Perception, PerceptionConfig
+from lerobot_latentsafe.datasets.clips import Clip
+from lerobot_latentsafe.datasets.frame_cache import basis_file
+from lerobot_latentsafe.encoders.perception import Perception, PerceptionConfig
+from lerobot_latentsafe.latent import Latent, replace_rows
+from lerobot_latentsafe.runtime.distributed import mean_over_ranks
+from lerobot_latentsafe.world_models.base import WorldModel, WorldModelConfig
+from lerobot_latentsafe.world_models.patch_summary import PatchSummary
 
 
 @WorldModelConfig.register_subclass("gru")
@@ -42,8 +46,8 @@ class GRUConfig(WorldModelConfig):
     observed: int = 6
     blind: bool = False
 
-    def adopt_cache(self, manifest: dict) -> None:
-        self.perception.adopt_cache(manifest)
+    def of_cache(self, manifest: dict) -> "GRUConfig":
+        return replace(self, perception=self.perception.of_cache(manifest))
 
     def build(self, image_keys: list[str], state_dim: int, action_dim: int) -> "FrameGRU":
         return FrameGRU(self, image_keys, state_dim, action_dim)
@@ -58,8 +62,9 @@ class FrameGRU(WorldModel):
             raise ValueError(
                 "a gru world model needs at least one camera, got none; record observation.image* features"
             )
-        self.config, self.image_keys, self.action_dim = config, sorted(image_keys), action_dim
+        self.image_keys, self.action_dim = sorted(image_keys), action_dim
         self.perception = Perception(config.perception, self.image_keys, config.image_size)
+        self.config = replace(config, perception=self.perception.config)
         n_vector, units = config.perception.components, config.units
         if config.summary:
             self.summary = PatchSummary(self.perception.n_patches, self.perception.token_dim, config.summary)
@@ -80,8 +85,8 @@ class FrameGRU(WorldModel):
     def percept_names(self) -> list[str]:
         return ["vector", "tokens"] if self.config.summary else ["vector"]
 
-    def load_basis(self, cache: Path) -> None:
-        self.perception.load_basis(cache)
+    def load_basis(self, root: Path) -> None:
+        self.perception.load_basis(basis_file(root))
 
     def perceive(self, images: dict[str, Tensor]) -> dict[str, Tensor]:
         seen = self.perception(images)

@@ -5,17 +5,19 @@ p(x_t | h_t) and a posterior q(x_t | h_t, o_t). Training reconstructs images and
 posterior together. Filtering and `step` carry means or modes, so they are deterministic; `sample_step` samples.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from lerobot_latentsafe.ranks import mean_over_ranks
-from lerobot_latentsafe.world_models.base import Clip, Latent, WorldModelConfig
-from lerobot_latentsafe.world_models.ends import EndAware
+from lerobot_latentsafe.datasets.clips import Clip
+from lerobot_latentsafe.latent import Latent
+from lerobot_latentsafe.runtime.distributed import mean_over_ranks
+from lerobot_latentsafe.world_models.base import WorldModelConfig
 from lerobot_latentsafe.world_models.stochastic import Categorical, Gaussian, Statistics
+from lerobot_latentsafe.world_models.termination import TerminationHead
 
 
 @WorldModelConfig.register_subclass("rssm")
@@ -142,7 +144,7 @@ class _ImageDecoder(nn.Module):
         return self.net(x.contiguous(memory_format=torch.channels_last))
 
 
-class RSSM(EndAware):
+class RSSM(TerminationHead):
     """See the module's text. Latent: h (B, H) and x (B, X), flat one-hot vectors where it is categorical."""
 
     def __init__(self, config: RSSMConfig, image_keys: list[str], state_dim: int, action_dim: int):
@@ -223,7 +225,7 @@ class RSSM(EndAware):
 
     def stop_drawing(self) -> None:
         """Forget the decoders: what is left is smaller, and learns no more."""
-        self.decoders, self.config.decoder = nn.ModuleDict(), False
+        self.decoders, self.config = nn.ModuleDict(), replace(self.config, decoder=False)
 
     def error(self, latent: Latent, percepts: dict[str, Tensor], state: Tensor) -> Tensor:
         if not self.draws:

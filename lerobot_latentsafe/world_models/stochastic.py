@@ -6,7 +6,7 @@ A network's raw output (..., n_raw) is read into statistics, a tuple of tensors,
 import torch
 from torch import Tensor
 
-from lerobot_latentsafe.ranks import rand_like, randn_like
+from lerobot_latentsafe.runtime.distributed import rand_like, randn_like
 
 Statistics = tuple[Tensor, ...]
 

@@ -9,8 +9,8 @@ from typing import Protocol
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from lerobot_latentsafe.franka.actions import GRIPPER_SPEED, GRIPPER_WIDTH
 from lerobot_latentsafe.robots.franka.config_franka import LatentSafeFrankaConfig
-from lerobot_latentsafe.robots.franka_interface import GRIPPER_SPEED, GRIPPER_WIDTH
 
 
 class FrankaError(RuntimeError):

@@ -10,9 +10,7 @@ from lerobot.robots.robot import Robot
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 from scipy.spatial.transform import Rotation, Slerp
 
-from lerobot_latentsafe.robots.franka.config_franka import LatentSafeFrankaConfig
-from lerobot_latentsafe.robots.franka.driver import ArmState, FrankaDriver, FrankaError, FrankyDriver, GripperError
-from lerobot_latentsafe.robots.franka_interface import (
+from lerobot_latentsafe.franka.actions import (
     ACTION_NAMES,
     GRIPPER_NAME,
     GRIPPER_WIDTH,
@@ -21,6 +19,8 @@ from lerobot_latentsafe.robots.franka_interface import (
     STATE_NAMES,
     read_action,
 )
+from lerobot_latentsafe.robots.franka.config_franka import LatentSafeFrankaConfig
+from lerobot_latentsafe.robots.franka.driver import ArmState, FrankaDriver, FrankaError, FrankyDriver, GripperError
 
 logger = logging.getLogger(__name__)
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from lerobot.robots.config import RobotConfig
 
-from lerobot_latentsafe.envs.scenes import check_scene
+from lerobot_latentsafe.franka.scenes import check_scene
 
 
 @RobotConfig.register_subclass("latentsafe_franka_mujoco")

@@ -6,10 +6,10 @@ import numpy as np
 from lerobot.robots.robot import Robot
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
-from lerobot_latentsafe.envs.scenes import SCENES, make_scene
-from lerobot_latentsafe.robots.announcements import Announcements
-from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, GRIPPER_NAME, JOINT_NAMES, STATE_NAMES, read_action
+from lerobot_latentsafe.franka.actions import ACTION_NAMES, GRIPPER_NAME, JOINT_NAMES, STATE_NAMES, read_action
+from lerobot_latentsafe.franka.scenes import SCENES, make_scene
 from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
+from lerobot_latentsafe.robots.lerobot_events import Announcements
 
 CAMERAS = ("front", "wrist")
 

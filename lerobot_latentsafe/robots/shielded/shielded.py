@@ -16,11 +16,11 @@ from lerobot.utils.constants import OBS_IMAGES, OBS_STATE, OBS_STR
 from lerobot.utils.feature_utils import build_dataset_frame
 
 from lerobot_latentsafe.configuration_latentsafe import DECIDES
+from lerobot_latentsafe.datasets.decisions import Journal
 from lerobot_latentsafe.datasets.frame_cache import check_proportions
-from lerobot_latentsafe.filter import FilterDecision, Reason
-from lerobot_latentsafe.robots.announcements import Announcements
+from lerobot_latentsafe.decision import FilterDecision, Reason
+from lerobot_latentsafe.robots.lerobot_events import Announcements
 from lerobot_latentsafe.robots.shielded.config_shielded import LatentSafeShieldedConfig
-from lerobot_latentsafe.robots.shielded.journal import Journal
 
 logger = logging.getLogger(__name__)
 

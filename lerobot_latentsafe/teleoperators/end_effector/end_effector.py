@@ -8,7 +8,7 @@ import numpy as np
 from lerobot.teleoperators.teleoperator import Teleoperator
 from lerobot.teleoperators.utils import make_teleoperator_from_config
 
-from lerobot_latentsafe.robots.franka_interface import ACTION_NAMES, action_limits
+from lerobot_latentsafe.franka.actions import ACTION_NAMES, action_limits
 from lerobot_latentsafe.teleoperators.end_effector.config_end_effector import LatentSafeEndEffectorConfig
 
 AXES = ("x", "y", "z")

@@ -1,0 +1,50 @@
+"""Every place that leans on the insides of LeRobot 0.6: look here first when a new version breaks something."""
+
+import logging
+import re
+from collections import deque
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from lerobot.configs.policies import PreTrainedConfig
+    from lerobot.policies.pretrained import PreTrainedPolicy
+
+RECORDING = re.compile(r"Recording episode (\d+)$")
+"""What LeRobot's loops log when an episode begins."""
+RESETTING = "Reset the environment"
+"""What they log between episodes."""
+RETURNING = "Returning robot to initial position"
+"""What they log before they move the robot back."""
+
+NOT_AVERAGED = "_ddp_params_and_buffers_to_ignore"
+"""The attribute in which torch's DistributedDataParallel, which LeRobot wraps policies in, looks for names."""
+
+
+def quiet_decoder() -> None:
+    """torchcodec without system FFmpeg logs a page of traceback; LeRobot then falls back to pyav by itself."""
+    logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
+
+
+def queued_actions(policy: "PreTrainedPolicy") -> deque | None:
+    """The queue that a LeRobot policy plays its chunks from, if it has one."""
+    queues = getattr(policy, "_queues", None)
+    if isinstance(queues, dict) and "action" in queues:
+        return queues["action"]
+    return getattr(policy, "_action_queue", None)
+
+
+def observation_queues(policy: "PreTrainedPolicy") -> dict[str, deque]:
+    """What a LeRobot policy remembers of observations and actions: key -> the last ones."""
+    return getattr(policy, "_queues", {})
+
+
+def set_observation_queues(policy: "PreTrainedPolicy", queues: dict[str, deque]) -> None:
+    """Give a policy such a memory."""
+    policy._queues = queues
+
+
+def planned_actions(config: "PreTrainedConfig") -> int:
+    """How many actions from now on a policy plans, of which it plays the first `n_action_steps`."""
+    if hasattr(config, "horizon"):  # of a diffusion policy, counted from its first observation on
+        return config.horizon - config.n_obs_steps + 1
+    return getattr(config, "chunk_size", getattr(config, "n_action_steps", 1))

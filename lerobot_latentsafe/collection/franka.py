@@ -1,0 +1,308 @@
+"""Recording the simulated Franka in bulk, through the same robot and operators as lerobot-record.
+
+Episodes are recorded in parts of a few dozen, each a finished dataset of its own in `<root>.parts`, by one process or
+several, and put together at the end: a run that was killed goes on with the parts that are missing, and never leaves a
+broken dataset. Episode i depends on the seed and i only.
+"""
+
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import cache, partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lerobot_latentsafe.collection.interventions import BRIEF, RETREATING, Hand, Interruptions
+from lerobot_latentsafe.datasets.labels import FAILING, SAFE
+from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES, action_limits, read_action
+from lerobot_latentsafe.franka.scenes import CLUMSINESS, HELD_ANYWHERE, SCENES
+
+if TYPE_CHECKING:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from lerobot_latentsafe.collection.policy_operator import PolicyOperator
+    from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
+
+EPISODES_A_PART = 50
+HIGH = 0.10
+"""Height of the hand below which the fingers may hold something, m."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """A dataset: its scene, how many episodes, and who moves the robot in each.
+
+    Attributes:
+        mix: behaviours of `teleoperators/scripted` with the number of episodes of each, in a dataset of full size;
+            smaller ones keep the proportions. Episodes of different behaviours are interleaved.
+        branches: episodes that start from each grasped state; 0 records whole episodes from the start.
+        grasps: of those states, the shares in which the bag is held by each of its segments, from its closed end on.
+        clumsiness: of those grasps: 1 is off by a few millimetres.
+        astray: share of episodes that start with the arm astray instead of at home: demonstrations that all go straight
+            to the bag never show a policy how to correct itself.
+        pushed: standard deviation of the speed in m/s at which the hand is pushed now and then, and high up its fingers
+            are closed, while the operator keeps them open. Recorded is what the operator commands, so that a policy
+            learns to correct and not to stray (DART, Laskey et al. 2017).
+        policies: the behaviours are names of policies, see `policy_operator.py`.
+        hand: how policies and operators are interrupted, if at all.
+        shield: name of the filter that says when, instead of chance.
+        seconds: how long an episode lasts; None: as long as the scene's.
+    """
+
+    scene: str
+    mix: dict[str, int]
+    variant: str | None = None
+    branches: int = 0
+    grasps: tuple[float, ...] = (0.6, 0, 0, 0.2, 0, 0, 0.2)
+    clumsiness: float = 1.0
+    astray: float = 0.0
+    pushed: float = 0.0
+    policies: bool = False
+    hand: Hand | None = None
+    shield: str | None = None
+    seconds: float | None = None
+
+    @property
+    def n_episodes(self) -> int:
+        return sum(self.mix.values())
+
+    def behavior(self, episode: int) -> str:
+        """Of an episode: behaviours follow each other in a fixed shuffle of the whole mix, over and over."""
+        names = np.repeat(list(self.mix), list(self.mix.values()))
+        return str(np.random.default_rng(0).permutation(names)[episode % len(names)])
+
+
+WEAK, STRONG = "bag_diffusion_weak", "bag_diffusion_strong"
+"""The committed policies of the bag."""
+
+SOURCES: dict[str, Source] = {
+    "bag_mix": Source("bag", {"random": 1000, "open_end": 75, "middle": 75, "closed_end": 100, "side_to_side": 50}),
+    "bag_branches": Source("bag", {"branch": 500}, branches=5),
+    "bag_climbs": Source("bag", {"climb": 200}, branches=4, grasps=(0.5, 0, 0, 0.1, 0, 0, 0.4)),
+    "bag_lifts": Source("bag", {"rise": 200}, branches=1, grasps=(0.5, 0, 0, 0, 0, 0, 0.5)),
+    "bag_between": Source("bag", {"branch": 100, "climb": 100}, branches=4, grasps=(0, 0.4, 0.2, 0, 0.2, 0.2, 0)),
+    "bag_dither": Source(
+        "bag", {"dither": 200, "branch": 100, "rise": 100}, branches=1, grasps=HELD_ANYWHERE, clumsiness=CLUMSINESS
+    ),
+    "bag_clumsy": Source("bag", {"clumsy": 120}),
+    # The weak one spills, of which there is more to learn; of the strong one, what is stopped without need.
+    "bag_policies": Source("bag", {WEAK: 150, STRONG: 50}, policies=True, hand=BRIEF, seconds=10.0),
+    "bag_shielded": Source("bag", {WEAK: 50, STRONG: 150}, policies=True, hand=RETREATING, shield="bag", seconds=10.0),
+    "bag_retreats": Source(
+        "bag", {"open_end": 80, "middle": 30, "closed_end": 90}, astray=0.3, hand=RETREATING, seconds=8.0
+    ),
+    "bag_pulls": Source("bag", {"open_end": 80, "middle": 30, "closed_end": 50, "side_to_side": 40}, astray=0.3),
+    "bag_middle": Source("bag", {"middle": 100}, astray=0.8),
+    "bag_strong": Source("bag", {"middle": 240}, astray=0.8, pushed=0.1),
+    "bag_weak": Source("bag", {"closed_end": 240}, variant="sealed", astray=0.8, pushed=0.1),
+    "blocks_demos": Source("blocks", {"fetch": 200}),
+    "blocks_random": Source("blocks", {"random": 200}),
+}
+"""What `latentsafe collect --source=...` can record of the Franka."""
+
+
+def features(source: Source) -> dict:
+    """The dataset's features; labels and rewards are no inputs of a policy (see `labels.py`)."""
+    size = SCENES[source.scene].image_size
+    image = {"dtype": "video", "shape": (size, size, 3), "names": ["height", "width", "channels"]}
+    return {
+        "observation.images.front": image,
+        "observation.images.wrist": dict(image),
+        "observation.state": {"dtype": "float32", "shape": (len(STATE_NAMES),), "names": STATE_NAMES},
+        "action": {"dtype": "float32", "shape": (len(ACTION_NAMES),), "names": ACTION_NAMES},
+        "failure": {"dtype": "int64", "shape": (1,), "names": None},
+        "next.reward": {"dtype": "float32", "shape": (1,), "names": None},
+        "next.success": {"dtype": "bool", "shape": (1,), "names": None},
+        "next.done": {"dtype": "bool", "shape": (1,), "names": None},
+    }
+
+
+def collect_franka(
+    name: str, repo_id: str, root: str | Path, n_episodes: int | None, seed: int, workers: int = 1
+) -> "LeRobotDataset":
+    """Record a source, or go on recording it.
+
+    Args:
+        n_episodes: None takes the source's.
+        workers: processes that record.
+
+    Raises:
+        ValueError: unknown source, no workers, or an unfinished recording of another source, seed or repo_id.
+        FileExistsError: root exists.
+    """
+    from lerobot.datasets.aggregate import aggregate_datasets
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from tqdm import tqdm
+
+    if name not in SOURCES:
+        raise ValueError(f"--source is {name!r}; expected one of {', '.join(SOURCES)}")
+    if workers < 1:
+        raise ValueError(f"--workers is {workers}; expected at least 1")
+    source, root = SOURCES[name], Path(root)
+    n_episodes = n_episodes or source.n_episodes
+    if root.exists():
+        raise FileExistsError(f"{root} exists; choose another --root or delete it")
+    parts = root.with_name(root.name + ".parts")
+    _claim(parts, f"{name} {repo_id} seed {seed}")
+    size = min(EPISODES_A_PART, -(-n_episodes // workers))
+    episodes = [range(start, min(start + size, n_episodes)) for start in range(0, n_episodes, size)]
+    record = partial(_record_part, source, repo_id, parts, seed=seed)
+    with ExitStack() as stack:
+        # Spawned: a process that was forked cannot draw.
+        apply = stack.enter_context(get_context("spawn").Pool(workers)).imap if workers > 1 else map
+        folders = list(tqdm(apply(record, episodes), desc=f"collecting {name}", total=len(episodes), unit="part"))
+    together = parts / "together"
+    shutil.rmtree(together, ignore_errors=True)
+    aggregate_datasets([repo_id] * len(folders), repo_id, roots=folders, aggr_root=together)
+    together.rename(root)
+    shutil.rmtree(parts)
+    return LeRobotDataset(repo_id, root=root)
+
+
+def _claim(parts: Path, what: str) -> None:
+    """Note what the parts are of, and refuse to mix."""
+    note = parts / "of.txt"
+    if note.exists() and note.read_text() != what:
+        raise ValueError(f"{parts} holds an unfinished recording of {note.read_text()!r}, not {what!r}; delete it")
+    parts.mkdir(parents=True, exist_ok=True)
+    note.write_text(what)
+
+
+def _record_part(source: Source, repo_id: str, parts: Path, episodes: range, seed: int) -> Path:
+    """The finished dataset of some episodes, recorded unless it is there."""
+    from lerobot.configs.video import RGBEncoderConfig
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
+    from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
+
+    part = parts / f"{episodes.start:06d}_{episodes.stop:06d}"
+    if part.exists():
+        return part
+    unfinished = part.with_suffix(".unfinished")
+    shutil.rmtree(unfinished, ignore_errors=True)
+    dataset = LeRobotDataset.create(
+        repo_id, SCENES[source.scene].fps, features(source), root=unfinished, robot_type=LatentSafeFrankaMujoco.name,
+        streaming_encoding=True, encoder_threads=1, metadata_buffer_size=EPISODES_A_PART,
+        rgb_encoder=RGBEncoderConfig(vcodec="h264", preset="veryfast", crf=20),
+    )  # fmt: skip
+    robot = LatentSafeFrankaMujoco(LatentSafeFrankaMujocoConfig(scene=source.scene, variant=source.variant))
+    with robot:
+        for episode in episodes:
+            for frame in episode_frames(robot, source, episode, seed):
+                dataset.add_frame(frame)
+            dataset.save_episode()
+    dataset.finalize()
+    return unfinished.rename(part)
+
+
+def episode_frames(robot: "LatentSafeFrankaMujoco", source: Source, episode: int, seed: int) -> Iterator[dict]:
+    """The frames of an episode as `LeRobotDataset.add_frame` takes them; the first failing frame and all after fail."""
+    from lerobot_latentsafe.franka.behaviors import GRASPED, stray
+
+    info, scene = SCENES[source.scene], robot.scene
+    start = episode // source.branches if source.branches else episode
+    robot.reset(_scene_seed(seed, start))
+    n_frames = round((source.seconds or info.episode_seconds) * info.fps)
+    if source.branches:
+        n_frames -= _grasp(robot, _scene_seed(seed, start), source)
+    rng = np.random.default_rng([8, _scene_seed(seed, start)])
+    if rng.random() < source.astray:
+        _go(robot, stray(scene, GRASPED[source.behavior(episode)], rng))
+    pushes = _pushes(source.pushed / info.fps, n_frames, rng)
+    failed = False
+    with _operator(robot, source, episode) as act:
+        for push in pushes:
+            failed |= bool(scene.truth()["failure"])
+            seen = robot.get_observation()
+            sent = _send_pushed(robot, act(seen), push)
+            after = scene.truth()
+            yield {
+                "observation.images.front": seen["front"],
+                "observation.images.wrist": seen["wrist"],
+                "observation.state": np.array([seen[name] for name in STATE_NAMES], np.float32),
+                "action": np.array([sent[name] for name in ACTION_NAMES], np.float32),
+                "failure": np.array([FAILING if failed else SAFE]),
+                "next.reward": np.array([after["reward"]], np.float32),
+                "next.success": np.array([after["is_success"] and not failed]),
+                # Nothing ends by itself: an episode lasts its time, and its last state could go on.
+                "next.done": np.array([False]),
+                "task": scene.task,
+            }
+
+
+@contextmanager
+def _operator(
+    robot: "LatentSafeFrankaMujoco", source: Source, episode: int
+) -> Iterator[Callable[[dict], dict[str, float]]]:
+    """Who moves the robot in an episode: observation -> action, clipped into its limits."""
+    from lerobot_latentsafe.teleoperators.scripted.config_scripted import LatentSafeScriptedConfig
+    from lerobot_latentsafe.teleoperators.scripted.scripted import LatentSafeScripted
+
+    behavior = source.behavior(episode)
+    if source.policies:
+        operator = _policy_operator(behavior, robot.scene.fps, source.hand, source.shield)
+        operator.begin(robot.scene.seed)
+        yield operator.act
+        return
+    with LatentSafeScripted(LatentSafeScriptedConfig(behavior=behavior, seed=episode)) as scripted:
+        if source.hand is None:
+            yield lambda seen: scripted.get_action()
+            return
+        rng = np.random.default_rng([9, robot.scene.seed])
+        interruptions = Interruptions(source.hand, action_limits(robot.scene.fps), rng)
+        yield lambda seen: _interrupted(scripted.get_action(), interruptions)
+
+
+def _interrupted(action: dict[str, float], interruptions: Interruptions) -> dict[str, float]:
+    executed, _ = interruptions(np.array([action[name] for name in ACTION_NAMES]))
+    return dict(zip(ACTION_NAMES, executed.tolist()))
+
+
+@cache
+def _policy_operator(path: str, fps: int, hand: Hand, shield: str | None) -> "PolicyOperator":
+    from lerobot_latentsafe.collection.policy_operator import PolicyOperator
+
+    return PolicyOperator(path, fps, hand, shield)
+
+
+def _pushes(sd: float, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Actions (n, 7) that are added to an operator's, each for 3 to 10 steps: moves half of the time, fingers less."""
+    moves = rng.normal(0, sd, (n, 6)) * [1, 1, 0.5, 0, 0, 4] * rng.integers(2, size=(n, 1))
+    closes = (rng.random(n) < 0.15) & (sd > 0)
+    return np.repeat(np.column_stack([moves, np.where(closes, -1.0, 0.0)]), rng.integers(3, 11, n), axis=0)[:n]
+
+
+def _send_pushed(robot: "LatentSafeFrankaMujoco", action: dict[str, float], push: np.ndarray) -> dict[str, float]:
+    """Act, pushed by (7,) unless the fingers are to close. Returns the action, clipped into its limits."""
+    wanted = read_action(action, robot.scene.fps).delta
+    pushed = wanted + push * (wanted[6] > 0.5)
+    if robot.scene.controller.position[2] < HIGH:  # fingers that have closed on something are to stay closed
+        pushed[6] = wanted[6]
+    robot.send_action(dict(zip(ACTION_NAMES, np.clip(pushed, *action_limits(robot.scene.fps)).tolist())))
+    return dict(zip(ACTION_NAMES, wanted.tolist()))
+
+
+def _scene_seed(seed: int, start: int) -> int:
+    return 1_000_000 * seed + start
+
+
+def _grasp(robot: "LatentSafeFrankaMujoco", seed: int, source: Source) -> int:
+    """Close the fingers on the bag, unrecorded. Returns the steps taken."""
+    from lerobot_latentsafe.franka.behaviors import grasp
+
+    rng = np.random.default_rng([7, seed])
+    segment = rng.choice(len(source.grasps), p=source.grasps)
+    return _go(robot, grasp(robot.scene, int(segment), rng, clumsiness=source.clumsiness))
+
+
+def _go(robot: "LatentSafeFrankaMujoco", actions: Iterator[np.ndarray]) -> int:
+    """Act, unrecorded. Returns the steps taken."""
+    steps = 0
+    for steps, action in enumerate(actions, 1):  # noqa: B007
+        robot.send_action(dict(zip(ACTION_NAMES, action.tolist())))
+    return steps

@@ -1,0 +1,69 @@
+"""A policy as the operator of a recording: what a filter is to judge is best seen while that acts."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.policies.utils import prepare_observation_for_inference
+from lerobot.utils.constants import OBS_IMAGES, OBS_STATE, OBS_STR
+from lerobot.utils.feature_utils import build_dataset_frame
+
+from lerobot_latentsafe.base_policy import BasePolicy
+from lerobot_latentsafe.collection.interventions import Hand, Interruptions
+from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES, action_limits
+from lerobot_latentsafe.franka.scene import CAMERAS
+from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+
+OBSERVED = {
+    OBS_STATE: {"dtype": "float32", "shape": (len(STATE_NAMES),), "names": STATE_NAMES},
+    **{f"{OBS_IMAGES}.{name}": {"dtype": "image"} for name in CAMERAS},
+}
+"""What a policy is given of an observation."""
+
+
+class PolicyOperator:
+    """Acts as a policy does that is interrupted: what it does next it does in no other recording.
+
+    Either when a filter would override it; or, for want of one that is any good yet, now and then.
+
+    Args:
+        path: of the policy; folder, Hub id or committed name.
+        fps: of the robot.
+        hand: what an interruption is like.
+        shield: path of a filter that says when to interrupt.
+    """
+
+    def __init__(self, path: str, fps: int, hand: Hand, shield: str | None = None):
+        self.limits, self.hand, self.filter = action_limits(fps), hand, None
+        if shield is None:
+            self.policy = BasePolicy(path, "cpu")
+            return
+        self.filter = LatentSafePolicy.from_pretrained(shield).eval()
+        self.filter.config.mode = "monitor"
+        self.filter.attach(path)
+        self.policy = self.filter.base
+
+    def begin(self, seed: int) -> None:
+        """Start an episode; what follows depends on the seed and on what is seen."""
+        torch.manual_seed(seed)
+        (self.filter or self.policy).reset()
+        self.interruptions = Interruptions(self.hand, self.limits, np.random.default_rng([9, seed]))
+
+    @torch.no_grad()
+    def act(self, seen: Mapping[str, Any]) -> dict[str, float]:
+        """The action for an observation of a LeRobot robot, clipped into its limits."""
+        batch = prepare_observation_for_inference(build_dataset_frame(OBSERVED, seen, OBS_STR), torch.device("cpu"))
+        if self.filter is None:
+            proposed, unsafe = self.policy.propose(batch), None
+        else:
+            decision = self.filter.decide(batch)
+            proposed, unsafe = decision.proposed, decision.unsafe.item()
+        proposed = np.clip(proposed[0].double().numpy(), *self.limits)
+        action, interrupted = self.interruptions(proposed, unsafe)
+        executed = torch.from_numpy(action).float()[None]
+        if interrupted:
+            self.policy.replan(executed)
+        if self.filter is not None:
+            self.filter.shield.was_executed(executed)
+        return dict(zip(ACTION_NAMES, action.tolist()))

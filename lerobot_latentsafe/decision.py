@@ -1,0 +1,195 @@
+"""Filter laws: given a value, decide whether a proposed action passes. Pure and batched."""
+
+from dataclasses import dataclass, field, fields, replace
+from enum import IntEnum
+
+import torch
+from torch import Tensor
+
+LAWS = ("reachability", "risk", "plan", "margin")
+MODES = ("filter", "monitor")
+RECENT = 10
+"""Steps whose overrides count for `retreat_after`."""
+
+
+class Reason(IntEnum):
+    """Why a decision fell as it did; anything but PASSED means the proposed action was not found safe."""
+
+    PASSED = 0
+    UNSAFE_VALUE = 1
+    VALUE_NOT_FINITE = 2
+    OBSERVATION_NOT_FINITE = 3
+    OBSERVATION_MISSING = 4
+    OBSERVATION_STALE = 5
+    ACTION_NOT_FINITE = 6
+    ACTION_OUT_OF_RANGE = 7
+    DEADLINE_MISSED = 8
+    BASE_POLICY_FAILED = 9
+    NO_BASE_POLICY = 10
+    WRONG_RATE = 11
+
+
+@dataclass
+class LawOptions:
+    """Changes of a filter's law; what is not given stays as it is. See `LawConfig`."""
+
+    name: str | None = None
+    """reachability, risk, plan or margin."""
+    epsilon: float | None = None
+    """The fallback acts where V is at or below this threshold."""
+    resume_above: float | None = None
+    """Once the fallback acts, the base policy acts again where V is above this."""
+    proposal_steps: int | None = None
+    """Imagined steps for which the proposed action is held before V is read."""
+    lookahead: int | None = None
+    """Imagined steps after those, before the critic's value is read; 0: the critic alone."""
+    samples: int | None = None
+    """Futures that a stochastic world model draws, of which the worst counts; 0: its mean or mode."""
+    history_frames: int | None = None
+    """Frames that the filter remembers at most; 0: the whole episode."""
+    retreat: dict[str, float] | None = None
+    """Command -> robot units a step, such as {delta_z.pos: -0.006}: a motion that leads back to safety."""
+    retreat_after: int | None = None
+    """Overrides in the last ten steps after which the next override is the retreat's."""
+    min_retreat_steps: int | None = None
+    """Steps for which a retreat goes on at least."""
+    deadline_ms: float | None = None
+    """A decision that took longer than this is not trusted: the fallback acts."""
+    mode: str | None = None
+    """filter, or monitor, which never acts and reports what it would have done."""
+
+
+@dataclass
+class LawConfig:
+    """When the filter acts, and what it does then. A user may change all of it.
+
+    Attributes:
+        name: what V is: `reachability`; or a baseline: `risk`, which needs a critic trained for it, `plan`, which
+            imagines holding each action, and `margin`, which reads l alone and stands still.
+        epsilon: the fallback acts where V of the predicted next latent is at or below this threshold. A risk critic's V
+            is -risk, so SQRL's threshold of 0.1 is an epsilon of -0.1.
+        resume_above: once the fallback has acted, the base policy acts again only where V is above this, if that is
+            more than epsilon. A policy that is stopped at every second step shakes what the fallback holds.
+        proposal_steps: steps for which the proposed action is imagined held before V is read. 1 is the paper's law;
+            more leave time for what the world model gets wrong, which a saturated margin cannot.
+        lookahead: steps of imagination before the critic's value is read, 0 to 25: V and the fallback are the best of
+            the critic's policy and of holding each action. 0 is the critic alone, and the cheapest.
+        samples: next latents drawn from a stochastic world model, of which the worst counts; 0 imagines its mean or
+            mode. If any, the critic is trained on drawn latents, too.
+        history_frames: frames that the filter remembers at most, and at least half as many; 0: the whole episode. A
+            recurrent world model may make anything of more frames than a clip of its training has.
+        retreat: a motion that is known to lead back to safety, command -> robot units a step, such as
+            {delta_z.pos: -0.006}; it acts where the critic's action did not help. V, the worst of all times, is the
+            same for waiting at a doubtful place as for leaving it, so the critic may wait.
+        retreat_after: overrides in the last ten steps after which the next override is the retreat's.
+        min_retreat_steps: steps for which a retreat goes on at least: a single step leads nowhere.
+        deadline_ms: if set, a decision that took longer is not trusted, and the fallback acts.
+        mode: `filter` overrides unsafe actions; `monitor` only reports what it would have done.
+    """
+
+    name: str = "reachability"
+    epsilon: float = 0.0
+    resume_above: float = -1.0
+    proposal_steps: int = 1
+    lookahead: int = 15
+    samples: int = 0
+    history_frames: int = 0
+    retreat: dict[str, float] = field(default_factory=dict)
+    retreat_after: int = 0
+    min_retreat_steps: int = 1
+    deadline_ms: float | None = None
+    mode: str = "filter"
+
+    def __post_init__(self) -> None:
+        expected = {
+            "name": (self.name in LAWS, f"one of {', '.join(LAWS)}"),
+            "mode": (self.mode in MODES, f"one of {', '.join(MODES)}"),
+            "lookahead": (0 <= self.lookahead <= 25, "0 (critic alone) to 25 imagined steps"),
+            "proposal_steps": (1 <= self.proposal_steps <= 25, "1 (the paper's law) to 25 steps"),
+            "retreat_after": (0 <= self.retreat_after <= RECENT, f"0 (retreat at once) to {RECENT} overrides"),
+            "min_retreat_steps": (self.min_retreat_steps >= 1, "at least 1 step"),
+            "history_frames": (self.history_frames == 0 or self.history_frames >= 2, "0 (all) or at least 2 frames"),
+            "resume_above": (self.resume_above < 1, "less than 1, which V never exceeds"),
+            "samples": (self.samples >= 0, "0 (mean or mode) or a number of draws"),
+        }  # fmt: skip
+        for name, (fits, what) in expected.items():
+            if not fits:
+                raise ValueError(f"--policy.law.{name} is {getattr(self, name)!r}; expected {what}")
+        if self.name == "risk" and self.lookahead:
+            raise ValueError(
+                f"--policy.law.lookahead is {self.lookahead}; a risk is read at the next latent: expected 0 with law 'risk'"
+            )
+
+    def changed(self, options: LawOptions) -> "LawConfig":
+        """This law with those of these options that are given.
+
+        Raises:
+            ValueError: what results is no law.
+        """
+        given = {f.name: value for f in fields(options) if (value := getattr(options, f.name)) is not None}
+        return replace(self, **given)
+
+    def passes_nothing_more_than(self, other: "LawConfig") -> bool:
+        """Whether every action that passes under this law passes under the other, too, which decides on the same V."""
+        ordered = ("epsilon", "resume_above", "min_retreat_steps")
+        stricter = all(getattr(self, name) >= getattr(other, name) for name in ordered)
+        in_time = other.deadline_ms is None or (self.deadline_ms is not None and self.deadline_ms <= other.deadline_ms)
+        alike = replace(self, **{name: getattr(other, name) for name in (*ordered, "deadline_ms", "mode")}) == other
+        return self.mode == "filter" and alike and stricter and in_time
+
+
+@dataclass
+class FilterDecision:
+    """One decision for each row of a batch; actions in robot units.
+
+    Attributes:
+        action: (B, A), what to execute.
+        proposed: (B, A), what the base policy wanted.
+        value: (B,), V of the latent predicted under the proposed action.
+        margin: (B,), l of the current latent; negative means it looks like a failure already.
+        unsafe: bool (B,), the law's verdict on the proposed action.
+        intervened: bool (B,), whether `action` is the fallback's; never in monitor mode.
+        reason: int64 (B,), a `Reason`.
+    """
+
+    action: Tensor
+    proposed: Tensor
+    value: Tensor
+    margin: Tensor
+    unsafe: Tensor
+    intervened: Tensor
+    reason: Tensor
+
+
+def least_restrictive(
+    proposed: Tensor,
+    fallback: Tensor,
+    value: Tensor,
+    margin: Tensor,
+    epsilon: float | Tensor,
+    fault: Tensor | None = None,
+    monitor: bool = False,
+) -> FilterDecision:
+    """The paper's law: pass the proposed action if V > epsilon at its predicted next latent, else fall back.
+
+    Args:
+        proposed, fallback: (B, A) in robot units.
+        value: (B,) V of the next latent; a value that is not finite is never safe.
+        margin: (B,) l of the current latent.
+        epsilon: threshold, or one for each row (B,).
+        fault: (B,) a `Reason` for rows that must not pass whatever their value; 0 elsewhere.
+        monitor: judge, but let every action through.
+    """
+    reason = torch.where(value > epsilon, Reason.PASSED, Reason.UNSAFE_VALUE)
+    reason = torch.where(torch.isfinite(value), reason, Reason.VALUE_NOT_FINITE)
+    if fault is not None:
+        reason = torch.where(fault != Reason.PASSED, fault, reason)
+    unsafe = reason != Reason.PASSED
+    intervened = torch.zeros_like(unsafe) if monitor else unsafe
+    action = torch.where(intervened[:, None], fallback, proposed)
+    return FilterDecision(action, proposed, value, margin, unsafe, intervened, reason)
+
+
+def first_fault(fault: Tensor, where: Tensor, reason: Reason) -> Tensor:
+    """Set a reason on rows (B,) that have none yet."""
+    return torch.where((fault == Reason.PASSED) & where, torch.full_like(fault, reason), fault)

@@ -1,0 +1,194 @@
+"""Episodes of one scene on disk, small pictures and all, in the order in which they were recorded."""
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.envs import preprocess_observation
+
+from lerobot_latentsafe.datasets.clips import ClipReader
+from lerobot_latentsafe.datasets.frame_cache import FOLDER, FrameCache, to_model_images
+from lerobot_latentsafe.datasets.labels import FAILING, SAFE, FailureLabels
+from lerobot_latentsafe.envs.franka_env import FrankaEnv
+from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES, action_limits
+from lerobot_latentsafe.franka.scene import FrankaScene
+from lerobot_latentsafe.policies.dreamer.behavior import TERMS
+from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
+
+CAMERA_KEYS = ("observation.images.front", "observation.images.wrist")
+Operator = Callable[[dict[str, torch.Tensor]], np.ndarray]
+"""Chooses actions (N, 7) in robot units from a LeRobot batch of observations. If it does something else than it meant,
+its attribute `meant` holds that."""
+
+
+def record(envs: list[FrankaEnv], seeds: list[int], operator: Operator, image_size: int) -> list[dict[str, np.ndarray]]:
+    """One episode in each environment: arrays by name, a row a frame, as `Replay` stores them.
+
+    Frame t holds o_t, the action taken after it, the one that was meant, whether the episode has failed by then, and
+    the reward's terms of arriving there.
+    """
+    observations, infos = zip(*[env.reset(seed=seed)[:2] for env, seed in zip(envs, seeds)])
+    low, high = action_limits(envs[0].metadata["render_fps"])
+    previous = [None, None]  # the last two actions (N, 7), in [-1, 1]
+    rows: list[dict[str, np.ndarray]] = []
+    for _ in range(envs[0]._max_episode_steps):
+        batch = preprocess_observation(_stacked(observations))
+        action = np.asarray(operator(batch), np.float32)
+        change = np.zeros(len(envs)) if previous[0] is None else np.square(previous[1] - previous[0]).sum(1)
+        terms = [[*(float(info[name]) for name in TERMS[:-1]), rate] for info, rate in zip(infos, change)]
+        rows.append(
+            {
+                **{key: _small(batch[key], image_size) for key in CAMERA_KEYS},
+                "state": batch["observation.state"].numpy(),
+                "action": action,
+                "meant": getattr(operator, "meant", action),
+                "failure": np.array([FAILING if info["failure"] else SAFE for info in infos], np.int8),
+                "terms": np.array(terms, np.float32),
+            }
+        )
+        previous = [previous[1], 2 * (action - low) / (high - low) - 1]
+        observations, _, _, _, infos = zip(*[env.step(a) for env, a in zip(envs, action)])
+    return [{name: np.stack([row[name][i] for row in rows]) for name in rows[0]} for i in range(len(envs))]
+
+
+def _stacked(observations: tuple[dict, ...]) -> dict:
+    pixels = {name: np.stack([o["pixels"][name] for o in observations]) for name in observations[0]["pixels"]}
+    return {"pixels": pixels, "agent_pos": np.stack([o["agent_pos"] for o in observations])}
+
+
+def _small(images: torch.Tensor, image_size: int) -> np.ndarray:
+    return (to_model_images(images, image_size) * 255).round().to(torch.uint8).numpy()
+
+
+@dataclass
+class Replay:
+    """Episodes of equal length in memory maps; episode i is written once, or again with the same content.
+
+    Attributes:
+        arrays: name -> (n_episodes x length, ...); percepts by camera, state, action, meant, failure, terms.
+        percepts: camera -> the same pictures on the device of training.
+        written: bool (n_episodes,).
+        length: frames of an episode.
+    """
+
+    arrays: dict[str, np.ndarray]
+    percepts: dict[str, torch.Tensor]
+    written: np.ndarray
+    length: int
+
+    @classmethod
+    def open(cls, folder: Path, n_episodes: int, length: int, image_size: int, device: str = "cpu") -> "Replay":
+        """Open, or make, a replay for so many episodes.
+
+        Raises:
+            ValueError: the folder holds one of another size.
+        """
+        folder.mkdir(parents=True, exist_ok=True)
+        n = n_episodes * length
+        shapes = {
+            **{key: ((n, 3, image_size, image_size), np.uint8) for key in CAMERA_KEYS},
+            "state": ((n, len(STATE_NAMES)), np.float32),
+            "action": ((n, len(ACTION_NAMES)), np.float32),
+            "meant": ((n, len(ACTION_NAMES)), np.float32),
+            "failure": ((n,), np.int8),
+            "terms": ((n, len(TERMS)), np.float32),
+            "written": ((n_episodes,), bool),
+        }
+        arrays = {}
+        for name, (shape, dtype) in shapes.items():
+            file = folder / f"{name}.npy"
+            if not file.exists():
+                np.lib.format.open_memmap(file, mode="w+", dtype=dtype, shape=shape).flush()
+            arrays[name] = np.load(file, mmap_mode="r+")
+            if arrays[name].shape != shape:
+                raise ValueError(
+                    f"{file} has shape {arrays[name].shape}, expected {shape}: it is of a run with other sizes; choose "
+                    "another --output_dir or delete it"
+                )
+        percepts = {key: torch.from_numpy(arrays[key]).to(device) for key in CAMERA_KEYS}
+        return cls(arrays, percepts, arrays.pop("written"), length)
+
+    def write(self, i: int, episode: dict[str, np.ndarray]) -> None:
+        """Store episode i. A killed process loses nothing of it: the system keeps mapped pages."""
+        frames = slice(i * self.length, (i + 1) * self.length)
+        for name, values in episode.items():
+            self.arrays[name][frames] = values
+        for key, pictures in self.percepts.items():
+            pictures[frames] = torch.from_numpy(episode[key]).to(pictures.device)
+        self.written[i] = True
+
+    def reader(self, n_episodes: int, clip_length: int) -> ClipReader:
+        """Clips of the first so many episodes."""
+        n = n_episodes * self.length
+        labels = FailureLabels(
+            self.arrays["failure"][:n], np.zeros(n, np.int8), np.repeat(np.arange(n_episodes), self.length)
+        )
+        cache = FrameCache(self.percepts, {}, self.arrays["state"], self.arrays["action"], {})
+        return ClipReader(labels, cache, clip_length)
+
+    def statistics(self, n_episodes: int) -> dict[str, dict[str, np.ndarray]]:
+        """What LeRobot's dataset statistics say of the first so many episodes' actions and states."""
+        state, action = (self.arrays[name][: n_episodes * self.length] for name in ("state", "action"))
+        return {
+            "action": {"min": action.min(0), "max": action.max(0)},
+            "observation.state": {"mean": state.mean(0), "std": state.std(0)},
+        }
+
+
+def described(fps: int) -> SimpleNamespace:
+    """What LeRobot's metadata would say of a replay's columns."""
+    features = {
+        "observation.state": {"dtype": "float32", "shape": (len(STATE_NAMES),), "names": STATE_NAMES},
+        "action": {"dtype": "float32", "shape": (len(ACTION_NAMES),), "names": ACTION_NAMES},
+        "failure": {"dtype": "int64", "shape": (1,), "names": None},
+        "next.done": {"dtype": "bool", "shape": (1,), "names": None},
+    }
+    return SimpleNamespace(repo_id="the replay", robot_type=LatentSafeFrankaMujoco.name, fps=fps, features=features)
+
+
+def export(replay: Replay, n_episodes: int, root: Path, repo_id: str, scene: FrankaScene) -> None:
+    """Write episodes as `latentsafe cache` would have: a LeRobotDataset without images, and a frame cache beside it.
+
+    Raises:
+        FileExistsError: root exists.
+    """
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from lerobot_latentsafe.datasets.build_cache import write_manifest
+
+    if root.exists():
+        raise FileExistsError(f"{root} exists; choose another --output_dir or delete it")
+    begun = root.with_name(f"{root.name}.begun")
+    shutil.rmtree(begun, ignore_errors=True)
+    columns = described(scene.fps)
+    dataset = LeRobotDataset.create(
+        repo_id, scene.fps, columns.features, root=begun, robot_type=columns.robot_type, use_videos=False,
+        metadata_buffer_size=100,
+    )  # fmt: skip
+    for t in range(n_episodes * replay.length):
+        state, action, failure = (replay.arrays[name][t] for name in ("state", "action", "failure"))
+        dataset.add_frame(
+            {
+                "observation.state": np.array(state),
+                "action": np.array(action),
+                "failure": np.array([failure], np.int64),
+                "next.done": np.array([False]),
+                "task": scene.task,
+            }
+        )
+        if (t + 1) % replay.length == 0:
+            dataset.save_episode()
+    dataset.finalize()
+    folder = begun / FOLDER
+    folder.mkdir()
+    for name in (*CAMERA_KEYS, "state", "action"):
+        np.save(folder / f"{name}.npy", replay.arrays[name][: n_episodes * replay.length])
+    seen = {key: [scene.image_size, scene.image_size, 3] for key in CAMERA_KEYS}
+    kept = {"image_size": replay.arrays[CAMERA_KEYS[0]].shape[-1], "percepts": list(CAMERA_KEYS)}
+    write_manifest(begun, LeRobotDatasetMetadata(repo_id, root=begun), seen, kept)
+    begun.rename(root)

@@ -1,0 +1,61 @@
+"""PrivilegedSafe: the same learner on the true state, dynamics and margin of the car (Table 1's other row)."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from lerobot_latentsafe.critic import ReachabilityConfig, SafetyCritic
+from lerobot_latentsafe.dubins import car
+from lerobot_latentsafe.latent import Latent
+from lerobot_latentsafe.reachability import LatentReachability
+
+
+class DubinsImagination:
+    """The car itself behind the `Imagination` protocol; a latent is {"state": (B, 3)}."""
+
+    sampled = False
+
+    def __init__(self, half_width: float = car.VIEW):
+        self.half_width = half_width
+
+    def step(self, latent: Latent, action: Tensor) -> Latent:
+        x, y, heading = latent["state"].unbind(-1)
+        return {
+            "state": torch.stack(
+                [
+                    x + car.DT * car.SPEED * torch.cos(heading),
+                    y + car.DT * car.SPEED * torch.sin(heading),
+                    heading + car.DT * car.MAX_TURN_RATE * action[:, 0],
+                ],
+                -1,
+            )
+        }
+
+    def features(self, latent: Latent) -> Tensor:
+        x, y, heading = latent["state"].unbind(-1)
+        return torch.stack([x, y, torch.cos(heading), torch.sin(heading)], -1)
+
+    def margin(self, latent: Latent) -> Tensor:
+        return latent["state"][..., :2].square().sum(-1) - car.RADIUS**2
+
+    def ended(self, latent: Latent) -> Tensor:
+        return latent["state"][..., :2].abs().amax(-1) > self.half_width
+
+    def complete(self, latent: Latent, action: Tensor) -> Tensor:
+        return action
+
+
+def train_privileged(config: ReachabilityConfig, seed: int, on_step=None) -> tuple[DubinsImagination, SafetyCritic]:
+    """Learn the safety value on true states (x, y, heading), uniform starts in the view."""
+    torch.manual_seed(seed)
+    imagination = DubinsImagination()
+    scale = torch.tensor([car.VIEW, car.VIEW, math.pi])
+    candidates = torch.tensor([[-1.0], [0.0], [1.0]])
+    critic = SafetyCritic(4, 1, candidates, config)
+    learner = LatentReachability(imagination, critic, lambda n: {"state": (2 * torch.rand(n, 3) - 1) * scale}, config)
+    for _ in range(config.steps):
+        metrics = learner.update()
+        if on_step is not None:
+            on_step(learner.step_count, metrics, critic)
+    return imagination, critic

@@ -1,0 +1,58 @@
+"""z, the latent of a world model: a batch-first dict of tensors, Markov by construction.
+
+Everything that a world model needs to go on is in it, among it the `action` (B, A) that led to it.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+Latent = dict[str, Tensor]
+
+
+def map_latent(latent: Latent, function: Callable[..., Tensor], *others: Latent) -> Latent:
+    """Apply a function to each tensor of a latent (and to the same tensors of others)."""
+    return {key: function(value, *(other[key] for other in others)) for key, value in latent.items()}
+
+
+def select(latent: Latent, index: Tensor | slice) -> Latent:
+    """Rows of a batch of latents."""
+    return map_latent(latent, lambda t: t[index])
+
+
+def replace_rows(latent: Latent, new: Latent, where: Tensor) -> Latent:
+    """Rows of `new` where the mask (B,) holds, of `latent` elsewhere."""
+    return map_latent(latent, lambda a, b: torch.where(where.reshape(-1, *[1] * (a.ndim - 1)), b, a), new)
+
+
+@dataclass(frozen=True)
+class Belief:
+    """What is believed of an episode so far.
+
+    Attributes:
+        latent: the posterior.
+        younger: where old frames are forgotten: one that knows the last frames only, and will take its place.
+        n_frames: seen so far.
+    """
+
+    latent: Latent | None = None
+    younger: Latent | None = None
+    n_frames: int = 0
+
+    def after(self, observe: Callable[[Latent | None], Latent], history_frames: int = 0) -> "Belief":
+        """One frame on.
+
+        Args:
+            observe: posterior, or None at the start -> that after the frame.
+            history_frames: frames to remember at most, and at least half as many; 0: all.
+        """
+        half = history_frames // 2
+        if not half:
+            latent, younger = observe(self.latent), None
+        elif self.n_frames % half == 0:
+            latent, younger = observe(self.younger), observe(None)
+        else:
+            latent, younger = observe(self.latent), observe(self.younger)
+        return Belief(latent, younger, self.n_frames + 1)

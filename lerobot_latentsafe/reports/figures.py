@@ -1,0 +1,118 @@
+"""Pictures where people would rather look."""
+
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+
+from lerobot_latentsafe.dubins import car
+from lerobot_latentsafe.evaluation.statistics import Episodes, wilson
+
+
+def save(figure: Figure, path: str | Path) -> None:
+    """Write a PNG, making folders as needed."""
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110, bbox_inches="tight")
+    plt.close(figure)
+
+
+def severities(episodes: dict[str, Episodes]) -> Figure:
+    """Share of the runs that spilled at least so much, with Wilson intervals (the paper's figure)."""
+    figure, ax = plt.subplots(figsize=(6, 3.2))
+    shares = np.linspace(0.01, 1, 100)
+    for (name, runs), colour in zip(episodes.items(), ("tab:red", "tab:blue")):
+        rates = [wilson((runs.severity >= share - 1e-9).sum(), len(runs.severity)) for share in shares]
+        ax.plot(100 * shares, [100 * rate["k"] / rate["n"] for rate in rates], color=colour, label=name)
+        low, high = ([100 * rate[end] for rate in rates] for end in ("low", "high"))
+        ax.fill_between(100 * shares, low, high, color=colour, alpha=0.15)
+    ax.set(xlabel="at least so much spilled (%)", ylabel="runs (%)", xlim=(0, 100), ylim=(0, 102))
+    ax.legend()
+    return figure
+
+
+def value_trace(trace: dict[str, list], epsilon: float) -> Figure:
+    """V and l along one shielded episode, the filter's moments shaded."""
+    t = np.arange(len(trace["value"])) * car.DT
+    figure, ax = plt.subplots(figsize=(7, 2.8))
+    ax.plot(t, trace["value"], label="V of the predicted next latent", color="tab:blue")
+    ax.plot(t, trace["margin"], label="margin l of the current latent", color="tab:gray")
+    ax.axhline(epsilon, color="k", lw=0.8, ls="--", label=f"epsilon = {epsilon:g}")
+    acted = np.array(trace["intervened"], bool)
+    ax.fill_between(t, -1, 1, where=acted, color="tab:orange", alpha=0.3, label="filter acts")
+    ax.set(xlabel="time (s)", ylim=(-1, 1))
+    ax.legend(fontsize=8, loc="lower right")
+    return figure
+
+
+def severity(lost: dict[str, list[int]], n_candies: int) -> Figure:
+    """Share of runs that spill at least p% of the candies, over p.
+
+    Args:
+        lost: name -> candies lost in each run; `who, shielded` is drawn in the colour of `who`, solid, others dashed.
+    """
+    figure, ax = plt.subplots(figsize=(5.6, 3.4))
+    level = np.array([1, *range(1, n_candies + 1)])  # any candy at all, then one more a step
+    p = 100 * np.arange(n_candies + 1) / n_candies
+    colours = {who: f"C{i}" for i, who in enumerate(dict.fromkeys(name.split(",")[0] for name in lost))}
+    for name, candies in lost.items():
+        share = (np.asarray(candies) >= level[:, None]).mean(1)
+        style, colour = "-" if name.endswith("shielded") else "--", colours[name.split(",")[0]]
+        ax.step(p, share, style, where="pre", color=colour, label=f"{name} (n = {len(candies)})")
+    ax.set(
+        xlabel="p, share of the candies (%)", ylabel="runs that spill at least p%", xlim=(0, 100), ylim=(-0.02, 1.02)
+    )
+    ax.legend(fontsize=8)
+    return figure
+
+
+def value_profiles(panels: dict[str, list[dict[str, list]]], epsilon: float, fps: int) -> Figure:
+    """V over time, a panel a situation: orange where the filter acts, grey lines where a candy first falls out.
+
+    Args:
+        panels: title -> episodes, each with value, intervened and spilled (candies outside) step by step.
+    """
+    figure, axes = plt.subplots(1, len(panels), figsize=(2.7 * len(panels), 2.6), sharey=True, squeeze=False)
+    for ax, (title, episodes) in zip(axes[0], panels.items()):
+        for episode in episodes:
+            value, acted = np.array(episode["value"]), np.array(episode["intervened"], bool)
+            t, spilled = np.arange(len(value)) / fps, np.flatnonzero(episode["spilled"])
+            ax.plot(t, value, color="tab:blue", lw=1, alpha=0.8)
+            ax.plot(t[acted], value[acted], ".", color="tab:orange", ms=4)
+            for first in spilled[:1]:
+                ax.axvline(t[first], color="0.6", lw=1)
+        ax.axhline(epsilon, color="k", lw=0.8, ls="--")
+        ax.set(title=title, xlabel="time (s)", ylim=(-1.05, 1.05))
+    axes[0, 0].set(ylabel=f"V (dashed: epsilon = {epsilon:g})")
+    figure.tight_layout()
+    return figure
+
+
+def write_videos(runs: dict[str, Episodes], folder: str | Path, fps: int = car.FPS) -> list[Path]:
+    """One mp4 an episode, bare and shielded side by side, an orange frame while the filter acts."""
+    paths = []
+    for i in range(min(len(r.frames) for r in runs.values())):
+        columns = {name: (r.frames[i], r.traces[i].get("intervened", [])) for name, r in runs.items()}
+        paths.append(write_side_by_side(columns, Path(folder) / f"episode_{i:03d}.mp4", fps))
+    return paths
+
+
+def write_side_by_side(columns: dict[str, tuple[list[np.ndarray], list[bool]]], path: Path, fps: int) -> Path:
+    """An mp4 of runs beside each other: name -> RGB frames, and at which of them the filter acts."""
+    import cv2
+    from lerobot.utils.io_utils import write_video
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    length, drawn = max(len(frames) for frames, _ in columns.values()), []
+    for name, (frames, acted) in columns.items():
+        frames = [cv2.resize(f, (256, 256), interpolation=cv2.INTER_NEAREST) for f in frames]
+        for t, frame in enumerate(frames):
+            cv2.putText(frame, name, (8, 20), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (40, 40, 40), 1, cv2.LINE_AA)
+            if t < len(acted) and acted[t]:
+                cv2.rectangle(frame, (0, 0), (255, 255), (255, 140, 0), 6)
+        drawn.append(frames + [frames[-1]] * (length - len(frames)))
+    write_video(str(path), [np.concatenate(pair, 1) for pair in zip(*drawn)], fps)
+    return path

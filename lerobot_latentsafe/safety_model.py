@@ -1,0 +1,185 @@
+"""World model, failure margin and safety critic as one plain object: no LeRobot policy, no history, no files.
+
+The shield, the evaluation, the task policy that learns in imagination and the LeRobot policy share it.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
+from lerobot_latentsafe.critic import BACKUPS, SafetyCritic, safety_bellman_target
+from lerobot_latentsafe.datasets.clips import Clip
+from lerobot_latentsafe.datasets.frame_cache import to_model_images
+from lerobot_latentsafe.latent import Latent
+from lerobot_latentsafe.margin import FailureMargin, hinge_loss
+from lerobot_latentsafe.reachability import look_ahead
+from lerobot_latentsafe.units import Units
+from lerobot_latentsafe.world_models.base import WorldModel
+
+
+class UntrainedFilterError(RuntimeError):
+    """The checkpoint has not been trained far enough for what is asked of it."""
+
+
+class LatentImagination:
+    """A world model and failure margin behind the `Imagination` protocol.
+
+    Args:
+        frozen: bool (A,), commands that a fallback leaves as they were, such as a gripper's.
+        sampled: draw what comes next from the world model's distribution, instead of its mean or mode.
+    """
+
+    def __init__(self, world_model: WorldModel, margin: FailureMargin, frozen: Tensor, sampled: bool = False):
+        self.world_model, self.failure_margin, self.frozen, self.sampled = world_model, margin, frozen, sampled
+
+    def step(self, latent: Latent, action: Tensor) -> Latent:
+        """Next latent under actions (B, A) in [-1, 1]."""
+        step = self.world_model.sample_step if self.sampled else self.world_model.step
+        return step(latent, action)
+
+    def features(self, latent: Latent) -> Tensor:
+        """(B, D), what actor and critic read."""
+        return self.world_model.features(latent)
+
+    def ended(self, latent: Latent) -> Tensor:
+        """Whether the episode is over in this latent: bool (B,)."""
+        return self.world_model.ended(latent)
+
+    def margin(self, latent: Latent) -> Tensor:
+        """Bounded margin l(z): (B,)."""
+        return self.failure_margin.bounded(self.world_model.features(latent))
+
+    def complete(self, latent: Latent, action: Tensor) -> Tensor:
+        """The action (B, A) with the frozen commands as they were before this latent."""
+        return torch.where(self.frozen.to(action.device), latent["action"], action)
+
+
+class SafetyModel(nn.Module):
+    """z, l, Q and the units of a robot.
+
+    Args:
+        config: of the filter; its `trained_on` must be filled in. The world model may complete `config.world_model`,
+            by the encoder that it found.
+
+    Attributes:
+        units: normalises and denormalises.
+        world_model, margin, critic: the parts.
+
+    Raises:
+        UntrainedFilterError: nothing says what actions and states look like.
+    """
+
+    def __init__(self, config: LatentSafeConfig):
+        super().__init__()
+        trained_on = config.trained_on
+        if trained_on.action_low is None:
+            raise UntrainedFilterError(
+                "this latentsafe policy has no dataset and no checkpoint: train one with lerobot-train "
+                "--policy.type=latentsafe --dataset.repo_id=..., or load one with --policy.path=..."
+            )
+        self.config = config
+        self.units = Units(trained_on, config.fallback.frozen_commands)
+        sizes = len(trained_on.state_mean), len(trained_on.action_low)
+        self.world_model = config.world_model.build(trained_on.cameras, *sizes)
+        config.change(world_model=self.world_model.config)
+        self.margin = self.new_margin()
+        self.critic = self.new_critic()
+
+    def new_margin(self) -> FailureMargin:
+        """A margin with fresh weights."""
+        config = self.config.margin
+        return FailureMargin(self.world_model.feature_dim, config.hidden, config.layers).to(self.device)
+
+    def new_critic(self) -> SafetyCritic:
+        """A critic with fresh weights, bounded to the commands that the fallback may move."""
+        units, fallback, candidates = self.units, self.config.fallback, None
+        if fallback.action_candidates is not None:
+            robots = torch.tensor(fallback.action_candidates, dtype=torch.float32, device=units.device)
+            candidates = units.normalise_action(robots)
+        bounds = fallback.bounds(units.action_names, units.action_varies & ~units.frozen)
+        sizes = self.world_model.feature_dim, len(units.action_low), candidates, self.config.reachability
+        return SafetyCritic(*sizes, *bounds, self.config.trained_on.target).to(self.device)
+
+    @property
+    def device(self) -> torch.device:
+        return self.units.device
+
+    @property
+    def imagination(self) -> LatentImagination:
+        """World model and margin, as reachability sees them."""
+        return LatentImagination(self.world_model, self.margin, self.units.frozen, self.config.law.samples > 0)
+
+    # -- seeing ---
+
+    def images(self, images: Tensor) -> Tensor:
+        """Pictures (..., 3, H, W), uint8 or in [0, 1], as the world model takes them."""
+        return to_model_images(images, self.config.world_model.image_size)
+
+    def see(self, observation: dict[str, Tensor]) -> tuple[dict[str, Tensor], Tensor]:
+        """Percepts and normalised proprioception (B, S) of a LeRobot batch of observations in robot units."""
+        device = self.device
+        images = {key: self.images(observation[key].to(device)) for key in self.world_model.image_keys}
+        state = self.units.normalise_state(observation["observation.state"].to(device))
+        return self.world_model.perceive(images), state
+
+    # -- deciding ---
+
+    def value(self, latent: Latent) -> Tensor:
+        """V(z) of latents (B, ...) -> (B,); see `plan`."""
+        return self.plan(latent)[0]
+
+    def plan(self, latent: Latent) -> tuple[Tensor, Tensor]:
+        """The safety value V(z), and the fallback action in [-1, 1]: (B,), (B, A).
+
+        min(l, max_a Q) of the critic (Eq. 4), read after `law.lookahead` imagined steps of the best of a few policies;
+        or what `law.name` says instead.
+        """
+        self.require_trained_for_law()
+        law, still = self.config.law, self.units.normalise_action(self.units.hold_action(1))
+        if law.name == "margin":
+            margin = self.imagination.margin(latent)
+            return margin, self.imagination.complete(latent, still.expand(len(margin), -1))
+        critic = self.critic if law.name in BACKUPS else None
+        return look_ahead(self.imagination, latent, self.critic.held_actions(still), law.lookahead, critic)
+
+    def worst(self, margin: Tensor, value: Tensor) -> Tensor:
+        """The value of going through a margin l to a latent of some value, all (...,): Eq. 5 undiscounted."""
+        return BACKUPS.get(self.config.law.name, safety_bellman_target)(margin, value, 1.0)
+
+    def require_trained_for_law(self) -> None:
+        """Raise unless training has come far enough for the law to decide."""
+        self.require_stage("critic" if self.config.law.name in BACKUPS else "world_model")
+
+    def require_stage(self, stage: str) -> None:
+        """Raise unless training has come at least this far, and the critic says what the law reads.
+
+        Raises:
+            UntrainedFilterError: naming what was never trained, and the command.
+            CriticTargetError: the critic was trained for something else.
+        """
+        self.config.require_critic_of_law()
+        trained_on = self.config.trained_on
+        if not trained_on.has_reached(stage):
+            part, command = {
+                "world_model": ("world model", "lerobot-train --policy.type=latentsafe"),
+                "critic": ("safety critic", "latentsafe train-reachability --policy.path=..."),
+            }[stage]
+            raise UntrainedFilterError(
+                f"this filter's stage is {trained_on.stage!r}, {stage!r} is needed: its {part} was never "
+                f"trained. Run {command} first"
+            )
+
+    # -- learning ---
+
+    def clip_loss(self, clip: Clip) -> tuple[Tensor, Tensor, dict[str, Tensor | float]]:
+        """The loss of a clip (world model, and Eq. 3 weighted), the features (B, T, D) of its frames, and metrics."""
+        loss, features, metrics = self.world_model.loss(clip)
+        margin = self.margin(features)
+        failure = torch.where(clip.valid, clip.failure, -1)
+        margin_loss = hinge_loss(margin, failure, self.config.margin.delta)
+        loss = loss + self.config.margin.weight * margin_loss
+        labelled = failure >= 0
+        correct = (((margin < 0) == (failure == 1)) & labelled).sum() / labelled.sum()
+        if self.training:  # a critic of the world model before knows nothing of this one
+            self.config.trained_on.stage = "world_model"
+        return loss, features, {**metrics, "loss_margin": margin_loss, "margin_accuracy": correct}
