@@ -39,7 +39,8 @@ More examples:
     <!--=results/dubins/shield_reckless_{0,1,2}.json shielded/overridden_share mean percent.1-->23.4%<!--/-->
     <!--=results/bag/cost.csv {tokens_bag,world_model_0}/{user_s,system_s} sum minutes-->26<!--/-->
 
-A marker must not begin a line or a list item (Markdown would take the whole line for HTML). Code is left alone.
+A marker must not begin a line or a list item (Markdown would take the whole line for HTML), and must not stand within
+`code` (Markdown would show it). Blocks of code are left alone.
 
 --check also refuses a results/**/*.json that lacks command, commit, seeds or cpu_minutes, or names a commit that is not
 in the history of HEAD.
@@ -62,6 +63,7 @@ from typing import Any
 
 PROVENANCE = ("command", "commit", "seeds", "cpu_minutes")
 FENCE = re.compile(r"\s*(?P<fence>`{3,}|~{3,})(?P<info>.*)")
+IN_CODE = re.compile(r"<!--\s*=\s*(?P<expression>results/.*?)-->", re.DOTALL)
 SPAN = re.compile(r"(?<!`)(?P<ticks>`{1,2})(?!`)(?:(?!\n\s*\n).)+?(?<!`)(?P=ticks)(?!`)", re.DOTALL)
 TOKEN = re.compile(r"<!--\s*=(?P<expression>.*?)(?:-->|\Z)|<!--\s*/\s*-->", re.DOTALL)
 LINE_START = re.compile(r"\s*(?:[-*+>]\s+|\d+[.)]\s+)*")
@@ -245,8 +247,8 @@ def pages(root: Path) -> list[Path]:
     return [p for p in (root / "README.md", *docs) if p.is_file()]
 
 
-def without_code(text: str) -> str:
-    """A page with spaces where it shows code. MyST directives (```{note}) hold no code, code cells do."""
+def without_blocks(text: str) -> str:
+    """A page with spaces in its blocks of code. MyST directives (```{note}) hold no code, code cells do."""
     lines: list[str] = []
     fences: list[tuple[str, bool]] = []  # the open ones, and whether they hold code
     for line in text.splitlines(keepends=True):
@@ -257,7 +259,7 @@ def without_code(text: str) -> str:
             info = fence["info"].strip()
             fences.append((fence["fence"], not info.startswith("{") or info.startswith("{code")))
         lines.append(blank(line) if fence or inside else line)
-    return SPAN.sub(lambda span: blank(span[0]), "".join(lines))
+    return "".join(lines)
 
 
 def blank(text: str) -> str:
@@ -267,7 +269,12 @@ def blank(text: str) -> str:
 
 def markers(text: str) -> Iterator[Marker | tuple[int, str, str]]:
     """Each marker of a page; of one that is not well-formed its line, its expression and what is wrong with it."""
-    text = without_code(text)
+    text = without_blocks(text)
+    for span in SPAN.finditer(text):
+        for token in IN_CODE.finditer(span[0]):
+            line = text.count("\n", 0, span.start() + token.start()) + 1
+            yield line, token["expression"], "the marker stands within `code`, which would show it; put it outside"
+    text = SPAN.sub(lambda span: blank(span[0]), text)
     tokens = [*TOKEN.finditer(text)]
     for token, following in zip(tokens, [*tokens[1:], None]):
         line, expression = text.count("\n", 0, token.start()) + 1, token["expression"]

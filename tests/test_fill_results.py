@@ -172,6 +172,7 @@ def test_expressions_that_cannot_be_filled(root, expression, message, capsys):
         ("A <!--=results/a.json rate of 4 of 120.\n", 1, "the marker is not closed"),
         ("A 4 of 120<!--/-->.\n", 1, "it closes no marker; remove it"),
         ("A\n<!--=results/a.json rate of-->4 of 120<!--/-->.\n", 2, "the marker begins its line"),
+        ("A\n`law.epsilon=<!--=results/a.json rate of-->4<!--/-->`.\n", 2, "the marker stands within `code`"),
         ("* <!--=results/a.json rate of-->4 of 120<!--/-->.\n", 1, "the marker begins its line"),
     ],
 )
@@ -182,14 +183,14 @@ def test_markers_that_are_not_well_formed(root, text, line, message, capsys):
     assert message in said
 
 
-def test_code_is_left_alone_but_directives_are_not(root):
+def test_blocks_of_code_are_left_alone_but_directives_are_not(root):
     marker = "<!--=results/a.json rate of-->old<!--/-->"
-    code = f"```text\n{marker}\n```\n", f"```{{code-cell}}\n{marker}\n```\n", f"Write `{marker}` or ``{marker}``.\n"
+    code = f"```text\n{marker}\n```\n", f"```{{code-cell}}\n{marker}\n```\n", "Write `<!--=EXPR-->` or ``<!--/-->``.\n"
     note = f"````{{note}}\nIt is {marker}.\n```bash\n{marker}\n```\n````\nIt is {marker}.\n"
     file = page(root, "\n".join([code[0], note, *code]))
     assert run(root) == 0
     assert file.read_text().count("It is <!--=results/a.json rate of-->4 of 120<!--/-->.") == 2
-    assert file.read_text().count(">old<") == 6
+    assert file.read_text().count(">old<") == 4
 
 
 def test_all_pages_but_what_sphinx_built(root):
