@@ -7,7 +7,7 @@ registries, and loads nothing heavy: models and simulators are imported when the
 from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
 from lerobot_latentsafe.envs.configuration_envs import LatentSafeBagEnv, LatentSafeBlocksEnv, LatentSafeDubinsEnv
 from lerobot_latentsafe.policies.dreamer.configuration_dreamer import LatentSafeDreamerConfig
-from lerobot_latentsafe.policies.grasp_prediction import PerceiveStep
+from lerobot_latentsafe.policies.grasp_prediction import GraspPredictionStep
 from lerobot_latentsafe.robots.franka.config_franka import LatentSafeFrankaConfig
 from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
 from lerobot_latentsafe.robots.shielded.config_shielded import LatentSafeShieldedConfig
@@ -15,6 +15,7 @@ from lerobot_latentsafe.teleoperators.end_effector.config_end_effector import La
 from lerobot_latentsafe.teleoperators.scripted.config_scripted import LatentSafeScriptedConfig
 
 __all__ = [
+    "GraspPredictionStep",
     "LatentSafeBagEnv",
     "LatentSafeBlocksEnv",
     "LatentSafeConfig",
@@ -25,6 +26,5 @@ __all__ = [
     "LatentSafeFrankaMujocoConfig",
     "LatentSafeScriptedConfig",
     "LatentSafeShieldedConfig",
-    "PerceiveStep",
 ]
 __version__ = "0.1.0"

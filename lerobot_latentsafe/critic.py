@@ -86,8 +86,8 @@ class ReachabilityConfig:
             where actions are rare in the data, the world model only guesses.
         components: principal components of the features that actor and critic read.
         horizon: imagined steps before a start is drawn anew (at most 25 in the paper).
-        learned_steps: the first steps of these whose states are learned on; the later ones only say what came of them. That
-            keeps the pool full of encoded observations, which is where the filter will ask.
+        learned_steps: the first steps of these whose states are learned on; the later ones only say what came of
+            them. That keeps the pool full of encoded observations, which is where the filter will ask.
         steps: gradient steps.
         batch_size: imagined states a gradient step; with discrete actions each is backed up under all of them.
         lr, actor_lr: AdamW step sizes, decayed over the second half.

@@ -117,7 +117,8 @@ class LawConfig:
                 raise ValueError(f"--policy.law.{name} is {getattr(self, name)!r}; expected {what}")
         if self.name == "risk" and self.lookahead:
             raise ValueError(
-                f"--policy.law.lookahead is {self.lookahead}; a risk is read at the next latent: expected 0 with law 'risk'"
+                f"--policy.law.lookahead is {self.lookahead}; a risk is read at the next latent: expected 0 with "
+                "law 'risk'"
             )
 
     def changed(self, options: LawOptions) -> "LawConfig":

@@ -3,15 +3,11 @@
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from huggingface_hub import ModelCard, ModelCardData
 
-from lerobot_latentsafe.configuration_latentsafe import LAWS, RECENT, LatentSafeConfig
-from lerobot_latentsafe.reports.html import share
-
-if TYPE_CHECKING:
-    from lerobot_latentsafe.policies.dreamer.configuration_dreamer import LatentSafeDreamerConfig
+from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
+from lerobot_latentsafe.decision import LAWS, RECENT, LawConfig
 
 TEXT = """---
 {header}
@@ -49,8 +45,8 @@ lerobot-eval --policy.path={repo_id} --policy.base_policy_path=<your policy> --e
 lerobot-teleoperate --robot.type=latentsafe_shielded --robot.filter={repo_id} --robot.inner.type=<your robot> ...
 ```
 
-First run it with `--policy.mode=monitor` or `--robot.mode=monitor`, which never acts and reports what it would have
-done.
+First run it with `--policy.law.mode=monitor` or `--robot.law.mode=monitor`, which never acts and reports what it would
+have done.
 
 {confusion}{evaluation}## Limits
 
@@ -78,12 +74,11 @@ lerobot-eval --policy.path={repo_id} --env.type=...
 
 
 def make_task_policy_card(
-    config: "LatentSafeDreamerConfig", dataset_repo_id: str, license: str | None, tags: list[str] | None
+    task: str, repo_id: str, dataset_repo_id: str, license: str | None, tags: list[str] | None
 ) -> ModelCard:
     """The card of a `latentsafe_dreamer` policy."""
     header = _header(dataset_repo_id, license, tags, "latentsafe_dreamer", "world-model")
-    repo_id = config.repo_id or "me/policy"
-    return ModelCard(TASK_POLICY_TEXT.format(header=header, task=config.task, dataset=dataset_repo_id, repo_id=repo_id))
+    return ModelCard(TASK_POLICY_TEXT.format(header=header, task=task, dataset=dataset_repo_id, repo_id=repo_id))
 
 
 def _header(dataset_repo_id: str, license: str | None, tags: list[str] | None, name: str, kind: str) -> str:
@@ -113,49 +108,49 @@ def make_model_card(
     config: LatentSafeConfig, dataset_repo_id: str, license: str | None, tags: list[str] | None
 ) -> ModelCard:
     """The card of a filter, from its configuration alone."""
-    actions = ", ".join(
-        f"{name} in [{low:g}, {high:g}]"
-        for name, low, high in zip(config.action_names or [], config.action_low or [], config.action_high or [])
-    )
+    trained_on, law = config.trained_on, config.law
+    actions = ", ".join(f"{name} in [{low:g}, {high:g}]" for name, (low, high) in trained_on.ranges.items())
     return ModelCard(
         TEXT.format(
             header=_header(dataset_repo_id, license, tags, "latentsafe", "safety-filter"),
             dataset=dataset_repo_id,
-            robot=f"`{config.robot_type}`" if config.robot_type else "unknown",
-            cameras=", ".join(f"`{c}` {tuple(config.input_features[c].shape)}" for c in config.cameras or []),
-            fps=config.fps,
+            robot=f"`{trained_on.robot_type}`" if trained_on.robot_type else "unknown",
+            cameras=", ".join(f"`{c}` {tuple(config.input_features[c].shape)}" for c in trained_on.cameras or []),
+            fps=trained_on.fps,
             actions=actions,
-            states=", ".join(config.state_names or []),
+            states=", ".join(trained_on.state_names or []),
             world_model=_world_model(config),
-            failure=config.failure_specification,
-            stage=config.stage,
-            law=f"{config.law}, V read after {config.guard} + {config.lookahead} imagined steps",
-            epsilon=threshold(config),
-            fallback=fallback(config),
+            failure=config.margin.failure_specification,
+            stage=trained_on.stage,
+            law=f"{law.name}, V read after {law.proposal_steps} + {law.lookahead} imagined steps",
+            epsilon=threshold(law),
+            fallback=fallback(law),
             calibration=_calibration(config.calibration),
             base=f"`{config.base_policy_path}`" if config.base_policy_path else "nothing yet",
             repo_id=config.repo_id or "me/filter",
-            imagination=_imagination(config.samples),
+            imagination=_imagination(law.samples),
             confusion=_confusion(config.calibration),
             evaluation=_evaluation(config.evaluation),
         )
     )
 
 
-def threshold(config: LatentSafeConfig) -> str:
+def threshold(law: LawConfig) -> str:
     """What V must exceed, in words."""
-    if config.release <= config.epsilon:
-        return f"{config.epsilon:g}"
-    return f"{config.epsilon:g}; once the filter acts, {config.release:g}"
+    if law.resume_above <= law.epsilon:
+        return f"{law.epsilon:g}"
+    return f"{law.epsilon:g}; once the filter acts, {law.resume_above:g}"
 
 
-def fallback(config: LatentSafeConfig) -> str:
+def fallback(law: LawConfig) -> str:
     """What acts in place of an unsafe action, in words."""
-    if not config.retreat:
+    if not law.retreat:
         return "the critic's action"
-    moves = ", ".join(f"{name} {motion:+g} a step" for name, motion in config.retreat.items())
-    after = f"the critic's action; after {config.patience} overrides within {RECENT} steps " if config.patience else ""
-    return f"{after}the retreat ({moves}) for at least {config.dwell} steps"
+    moves = ", ".join(f"{name} {motion:+g} a step" for name, motion in law.retreat.items())
+    after = (
+        f"the critic's action; after {law.retreat_after} overrides within {RECENT} steps " if law.retreat_after else ""
+    )
+    return f"{after}the retreat ({moves}) for at least {law.min_retreat_steps} steps"
 
 
 def _world_model(config: LatentSafeConfig) -> str:
@@ -163,7 +158,7 @@ def _world_model(config: LatentSafeConfig) -> str:
     if perception := getattr(config.world_model, "perception", None):
         text += f", on {perception.components} components of the frozen encoder `{perception.encoder}`"
         text += f" (weights {perception.encoder_hash}), which is not part of the checkpoint"
-    return text + (f"; remembers {config.memory} frames at most" if config.memory else "")
+    return text + (f"; remembers {frames} frames at most" if (frames := config.law.history_frames) else "")
 
 
 def _imagination(samples: int) -> str:
@@ -221,6 +216,12 @@ def measured(file: str | Path, law: str) -> dict[str, str]:
     return {**{f"{stem}: {what}": rate for what, rate in rates.items()}, f"{stem}: made by": made}
 
 
+def rate_in_words(rate: dict[str, float]) -> str:
+    """`12/200 = 6.0% [3.5, 10.2]` from a Wilson record."""
+    k, n = rate["k"], rate["n"]
+    return f"{k}/{n} = {k / n:.1%} [{100 * rate['low']:.1f}, {100 * rate['high']:.1f}]"
+
+
 def _rates(content: dict, law: str, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], str]]:
     for name, entry in content.items():
         if "pooled" in content and name not in ("bare", "pooled"):
@@ -229,7 +230,7 @@ def _rates(content: dict, law: str, path: tuple[str, ...] = ()) -> Iterator[tupl
             continue
         if {"k", "n"} <= entry.keys():
             if name in RATES:
-                yield (*path, name.replace("_", " ")), share(entry)
+                yield (*path, name.replace("_", " ")), rate_in_words(entry)
         else:
             yield from _rates(entry, law, (*path, name))
             if "overridden_share" in entry and name != "bare":

@@ -41,6 +41,11 @@ BASE_FOLDER = "base_policy"
 class LatentSafePolicy(PreTrainedPolicy):
     """A safety model behind a shield and, optionally, the base policy that they shield.
 
+    Args:
+        config: of the filter.
+        dataset_stats, dataset_meta: of the dataset to train on, as LeRobot's `make_policy` gives them.
+        model: a safety model that exists already; by default one with fresh weights.
+
     Attributes:
         model: world model, margin, critic and units.
         shield: history, faults and the law.
@@ -50,12 +55,15 @@ class LatentSafePolicy(PreTrainedPolicy):
     config_class = LatentSafeConfig
     name = "latentsafe"
 
-    def __init__(self, config: LatentSafeConfig, dataset_stats=None, dataset_meta=None, **kwargs: Any):
+    def __init__(
+        self, config: LatentSafeConfig, dataset_stats=None, dataset_meta=None, model: SafetyModel | None = None,
+        **kwargs: Any,
+    ):  # fmt: skip
         super().__init__(config)
         data = None
         if dataset_meta is not None:
             data = adopt(config, dataset_meta, dataset_stats or dataset_meta.stats)
-        self.model = SafetyModel(config)
+        self.model = model or SafetyModel(config)
         config.validate_features()
         self.reader = data and data.reader(config.world_model.clip_length, self.model.units)
         if data is not None and data.cache is not None:
@@ -242,7 +250,7 @@ def adopt(config: LatentSafeConfig, meta: Any, stats: dict) -> FilterData:
     )  # fmt: skip
     data.check_cameras({key: config.input_features[key].shape for key in data.cameras if key in config.input_features})
     trained_on = adopt_dataset(config.trained_on, meta, stats)
-    trained_on.cameras = sorted(data.cameras)
+    trained_on.cameras = list(data.cameras)
     check_candidates(config.fallback.action_candidates, trained_on)
     pictures = {key: PolicyFeature(FeatureType.VISUAL, shape) for key, shape in data.cameras.items()}
     world_model = config.world_model

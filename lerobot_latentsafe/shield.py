@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from lerobot_latentsafe.configuration_latentsafe import SEALED
-from lerobot_latentsafe.datasets.frame_cache import check_proportions
 from lerobot_latentsafe.decision import RECENT, FilterDecision, Reason, first_fault, least_restrictive
+from lerobot_latentsafe.encoders.pictures import check_proportions
 from lerobot_latentsafe.latent import Belief, Latent, map_latent, replace_rows
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
 from lerobot_latentsafe.safety_model import SafetyModel
@@ -95,7 +95,7 @@ class Shield:
         return decision
 
     def _judge(self, latent: Latent, inputs: Tensor, state: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """V of the proposal and l now (B,), whether an override would be the retreat's (B,), and the fallback (B, A)."""
+        """V of the proposal and l now (B,); whether an override would be the retreat's (B,); the fallback (B, A)."""
         model = self.model
         margin = model.imagination.margin(latent)
         predicted, on_the_way = self._go_on(latent, inputs)
@@ -279,7 +279,7 @@ class Shield:
         return torch.where(finite[:, None], self.model.units.denormalise_action(action), self._hold(state))
 
     def _hold(self, state: Tensor) -> Tensor:
-        """No motion, and the frozen commands as they were, or are seen to be if nothing was executed yet: robot units."""
+        """No motion, frozen commands as they were, or as seen if nothing was executed yet: (B, A) in robot units."""
         units, still = self.model.units, self.model.units.hold_action(len(state))
         before = units.commands_seen(state) if self.executed is None else units.denormalise_action(self.executed)
         return torch.where(units.frozen & before.isfinite(), before, still)

@@ -29,7 +29,8 @@ class TrainedOn:
         fps: frames a second.
         state_names, action_names: of the numbers of `observation.state` and `action`, in order.
         action_low, action_high: least and largest command of the data.
-        action_varies: False for commands that the data never vary; the filter keeps those and knows nothing else of them.
+        action_varies: False for commands that the data never vary; the filter keeps those and knows nothing else of
+            them.
         state_mean, state_std: of the data.
     """
 

@@ -11,12 +11,19 @@ import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.datasets.dataset_tools import remove_feature
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.utils.constants import ACTION, OBS_STATE
+from safetensors.torch import load_file, save_file
 from torch import Tensor
+from tqdm import tqdm
 
+from lerobot_latentsafe.datasets.episodes import DatasetFrames
 from lerobot_latentsafe.datasets.frame_cache import (
     BASIS,
     FOLDER,
@@ -24,17 +31,13 @@ from lerobot_latentsafe.datasets.frame_cache import (
     VERSION,
     FrameCache,
     FrameCacheError,
+    basis_file,
     dataset_fingerprint,
-    to_model_images,
 )
+from lerobot_latentsafe.encoders.perception import Perception, PerceptionConfig
+from lerobot_latentsafe.encoders.pictures import to_model_images
+from lerobot_latentsafe.runtime.files import refuse_existing, replacing
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
-
-if TYPE_CHECKING:
-    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    from lerobot_latentsafe.datasets.episodes import DatasetFrames
-    from lerobot_latentsafe.encoders.perception import PerceptionConfig
 
 LAYOUT, DONE = "layout.json", "done.npy"
 ENCODED_AT_ONCE = 8
@@ -88,11 +91,9 @@ class Tokens:
     """
 
     def __init__(
-        self, cameras: list[str], image_size: int, config: "PerceptionConfig", dtype: str = "float16",
+        self, cameras: list[str], image_size: int, config: PerceptionConfig, dtype: str = "float16",
         basis_from: str | Path | None = None,
     ):  # fmt: skip
-        from lerobot_latentsafe.encoders.perception import Perception
-
         if dtype not in ("float16", "int8"):
             raise ValueError(f"--dtype is {dtype!r}; expected float16 or int8")
         self.perception, self.dtype, self.basis_from = Perception(config, cameras, image_size), dtype, basis_from
@@ -106,14 +107,12 @@ class Tokens:
         self.manifest = {
             "image_size": image_size,
             "percepts": ["tokens", "vector"],
-            "encoder": config.encoder,
-            "encoder_hash": config.encoder_hash,
+            "encoder": self.perception.config.encoder,
+            "encoder_hash": self.perception.config.encoder_hash,
         }
 
     def prepare(self, folder: Path, see: See, n_episodes: int) -> None:
         """Take the principal components from elsewhere, or find them in a sample of frames."""
-        from safetensors.torch import save_file
-
         if self.basis_from is not None:
             other = FrameCache.open(self.basis_from)
             if other.manifest.get("encoder_hash") != self.manifest["encoder_hash"]:
@@ -126,7 +125,7 @@ class Tokens:
                     f"the cache in {self.basis_from} sees {', '.join(sorted(other.manifest['cameras']))}, this dataset "
                     f"has {', '.join(self.perception.image_keys)}; their principal components do not fit"
                 )
-            shutil.copyfile(Path(self.basis_from) / FOLDER / BASIS, folder / BASIS)
+            shutil.copyfile(basis_file(self.basis_from), folder / BASIS)
             return
         rng = np.random.default_rng(0)
         episodes = rng.permutation(n_episodes)[:SAMPLED_EPISODES]
@@ -141,8 +140,6 @@ class Tokens:
         save_file(self.perception.basis.state_dict(), folder / BASIS)
 
     def start(self, folder: Path) -> None:
-        from safetensors.torch import load_file
-
         self.perception.basis.load_state_dict(load_file(folder / BASIS))
         self.manifest["basis_hash"] = hashlib.sha256((folder / BASIS).read_bytes()).hexdigest()[:16]
 
@@ -169,7 +166,7 @@ def eight_bits(tokens: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def build_frame_cache(
-    dataset: "LeRobotDataset", output_dir: str | Path, image_size: int,
+    dataset: LeRobotDataset, output_dir: str | Path, image_size: int,
     recipe: Callable[[list[str], int], Recipe] = Pictures,
 ) -> FrameCache | None:  # fmt: skip
     """Make a cache, or go on making it.
@@ -184,17 +181,13 @@ def build_frame_cache(
         FileExistsError: output_dir holds something else, a finished cache, or an unfinished one of something else.
         FrameCacheError: the dataset has no camera.
     """
-    from tqdm import tqdm
-
-    from lerobot_latentsafe.datasets.episodes import DatasetFrames
-
     output_dir, folder = Path(output_dir), Path(output_dir) / FOLDER
     if not dataset.meta.camera_keys:
         raise FrameCacheError(f"{dataset.repo_id} has no camera; its features are {list(dataset.meta.features)}")
     rank, world = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
     unfinished = (folder / LAYOUT).exists() and not (folder / MANIFEST).exists()
-    if rank == 0 and output_dir.exists() and not unfinished:
-        raise FileExistsError(f"{output_dir} exists; choose another --output_dir or delete it")
+    if rank == 0 and not unfinished:
+        refuse_existing(output_dir)
     frames = DatasetFrames(dataset.meta)
     see = lambda episode: _episode_images(frames, episode, image_size)  # noqa: E731
     kept = recipe(frames.cameras, image_size)
@@ -216,7 +209,7 @@ def build_frame_cache(
     return _finish(dataset, output_dir, kept) if done.all() else None
 
 
-def _episode_images(frames: "DatasetFrames", episode: int, image_size: int) -> dict[str, Tensor]:
+def _episode_images(frames: DatasetFrames, episode: int, image_size: int) -> dict[str, Tensor]:
     images = {}
     for key in frames.cameras:
         stored = torch.from_numpy(frames.images(key, episode)).permute(0, 3, 1, 2)
@@ -224,16 +217,13 @@ def _episode_images(frames: "DatasetFrames", episode: int, image_size: int) -> d
     return images
 
 
-def _layout(dataset: "LeRobotDataset", kept: Recipe) -> dict:
+def _layout(dataset: LeRobotDataset, kept: Recipe) -> dict:
     """Tells whether an unfinished cache is of the same thing."""
     return json.loads(json.dumps([dataset_fingerprint(dataset.meta), kept.arrays, kept.manifest]))
 
 
-def _lay_out(dataset: "LeRobotDataset", output_dir: Path, kept: Recipe, see: See) -> None:
+def _lay_out(dataset: LeRobotDataset, output_dir: Path, kept: Recipe, see: See) -> None:
     """Copy the dataset without images and make room for all frames; output_dir appears when that is done."""
-    from lerobot.datasets.dataset_tools import remove_feature
-    from lerobot.utils.constants import ACTION, OBS_STATE
-
     begun = output_dir.with_name(f"{output_dir.name}.begun")
     folder, n = begun / FOLDER, dataset.num_frames
     shutil.rmtree(begun, ignore_errors=True)
@@ -253,7 +243,7 @@ def _lay_out(dataset: "LeRobotDataset", output_dir: Path, kept: Recipe, see: See
     begun.rename(output_dir)
 
 
-def _await_layout(dataset: "LeRobotDataset", folder: Path, kept: Recipe, patience_s: float = 600) -> None:
+def _await_layout(dataset: LeRobotDataset, folder: Path, kept: Recipe, patience_s: float = 600) -> None:
     """Wait until the first process has laid the cache out, and check that it is this one."""
     given_up = time.monotonic() + patience_s
     while not (folder / LAYOUT).exists():
@@ -267,15 +257,13 @@ def _await_layout(dataset: "LeRobotDataset", folder: Path, kept: Recipe, patienc
         )
 
 
-def _finish(dataset: "LeRobotDataset", output_dir: Path, kept: Recipe) -> FrameCache:
-    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-
+def _finish(dataset: LeRobotDataset, output_dir: Path, kept: Recipe) -> FrameCache:
     cameras = {key: list(dataset.meta.features[key]["shape"]) for key in dataset.meta.camera_keys}
     write_manifest(output_dir, dataset.meta, cameras, kept.manifest)
     return FrameCache.open(output_dir, LeRobotDatasetMetadata(f"{dataset.repo_id}_cache", root=output_dir))
 
 
-def write_manifest(root: Path, meta: "LeRobotDatasetMetadata", cameras: dict[str, list[int]], percepts: dict) -> None:
+def write_manifest(root: Path, meta: LeRobotDatasetMetadata, cameras: dict[str, list[int]], percepts: dict) -> None:
     """Note what the arrays in a dataset's frame cache are of, which makes them a cache.
 
     Args:
@@ -296,6 +284,5 @@ def write_manifest(root: Path, meta: "LeRobotDatasetMetadata", cameras: dict[str
 
 def _write(file: Path, content: object) -> None:
     """Atomically, whichever of several processes does it."""
-    partial = file.with_name(f"{file.name}.{os.getpid()}.partial")
-    partial.write_text(json.dumps(content, indent=2))
-    os.replace(partial, file)
+    with replacing(file) as partial:
+        partial.write_text(json.dumps(content, indent=2))

@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_latentsafe.datasets.frame_cache import FOLDER, FrameCache, FrameCacheError, check_proportions
+from lerobot_latentsafe.datasets.frame_cache import FOLDER, FrameCache, FrameCacheError
 from lerobot_latentsafe.datasets.labels import FailureLabels
+from lerobot_latentsafe.encoders.pictures import check_proportions
 from lerobot_latentsafe.units import Units
 
 

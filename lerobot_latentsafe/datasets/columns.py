@@ -1,20 +1,22 @@
-"""Labels as data: label files become columns of a copy of the dataset, for those who have only LeRobot."""
+"""Labels and decisions as data: columns of a copy of the dataset, for those who have only LeRobot."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from tempfile import TemporaryDirectory
 
+from lerobot.datasets.dataset_tools import modify_features, remove_feature
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from lerobot_latentsafe.datasets.decisions import FILE, decision_columns
 from lerobot_latentsafe.datasets.labels import LabelFileError, Sidecar, read_frames, sidecar_path, specifications_of
-from lerobot_latentsafe.runtime.hub import HubUnreachableError
-
-if TYPE_CHECKING:
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot_latentsafe.runtime.files import refuse_existing
+from lerobot_latentsafe.runtime.hub import HUB_FAILURES, HubUnreachableError
 
 COLUMN = {"dtype": "int64", "shape": (1,), "names": None}
 
 
 def write_columns(
-    dataset: "LeRobotDataset", specifications: list[str], output_dir: str | Path, repo_id: str
-) -> "LeRobotDataset":
+    dataset: LeRobotDataset, specifications: list[str], output_dir: str | Path, repo_id: str
+) -> LeRobotDataset:
     """A copy of a dataset with one column of 1 (failing), 0 (safe), -1 (unlabelled) for each specification.
 
     A column of the same name is replaced: the label file was started from it.
@@ -23,7 +25,7 @@ def write_columns(
         LabelFileError: a specification without a label file.
         FileExistsError: output_dir exists.
     """
-    _refuse_existing(output_dir)
+    refuse_existing(output_dir)
     frames, columns = read_frames(dataset.root, ["action"]), {}
     for name in specifications:
         path = sidecar_path(dataset.root, name)
@@ -34,18 +36,16 @@ def write_columns(
     return _with_columns(dataset, columns, output_dir, repo_id)
 
 
-def write_decisions(dataset: "LeRobotDataset", output_dir: str | Path, repo_id: str) -> "LeRobotDataset":
+def write_decisions(dataset: LeRobotDataset, output_dir: str | Path, repo_id: str) -> LeRobotDataset:
     """A copy of a recording with the shield's decisions as columns `shield.proposed`, `.value`, `.margin`,
-    `.intervened` (0 or 1) and `.reason` (a `filter.Reason`).
+    `.intervened` (0 or 1) and `.reason` (a `Reason`).
 
     Raises:
         FileNotFoundError: it was not recorded by `latentsafe record`.
         ValueError: the decisions belong to another dataset.
         FileExistsError: output_dir exists.
     """
-    from lerobot_latentsafe.datasets.decisions import FILE, decision_columns
-
-    _refuse_existing(output_dir)
+    refuse_existing(output_dir)
     found = decision_columns(Path(dataset.root) / FILE, read_frames(dataset.root, ["frame_index", "action"]))
     columns = {}
     for name, values in found.items():
@@ -55,38 +55,26 @@ def write_decisions(dataset: "LeRobotDataset", output_dir: str | Path, repo_id: 
     return _with_columns(dataset, columns, output_dir, repo_id)
 
 
-def _refuse_existing(output_dir: str | Path) -> None:
-    if Path(output_dir).exists():
-        raise FileExistsError(f"{output_dir} exists; choose another --output_dir or delete it")
-
-
-def _with_columns(dataset: "LeRobotDataset", columns: dict, output_dir: str | Path, repo_id: str) -> "LeRobotDataset":
+def _with_columns(dataset: LeRobotDataset, columns: dict, output_dir: str | Path, repo_id: str) -> LeRobotDataset:
     """A copy of a dataset with these columns, each (values, feature); one of the same name is replaced."""
-    from lerobot.datasets.dataset_tools import modify_features, remove_feature
-
     replaced = [name for name in columns if name in dataset.meta.features]
     if not replaced:
         return modify_features(dataset, columns, output_dir=output_dir, repo_id=repo_id)
     # LeRobot refuses to add what it removes in the same pass.
-    from tempfile import TemporaryDirectory
-
     with TemporaryDirectory(dir=Path(output_dir).parent) as folder:
         bare = remove_feature(dataset, replaced, output_dir=Path(folder) / "bare", repo_id=repo_id)
         return modify_features(bare, columns, output_dir=output_dir, repo_id=repo_id)
 
 
-def push_dataset(dataset: "LeRobotDataset", private: bool = False) -> None:
+def push_dataset(dataset: LeRobotDataset, private: bool = False) -> None:
     """Push a dataset to the Hub.
 
     Raises:
         HubUnreachableError: the Hub did not answer or refused; the copy on disk is whole.
     """
-    import httpx
-    from huggingface_hub.errors import HfHubHTTPError, OfflineModeIsEnabled
-
     try:
         dataset.push_to_hub(private=private, tags=["latentsafe", "failure-labels"])
-    except (HfHubHTTPError, OfflineModeIsEnabled, httpx.HTTPError, OSError) as e:
+    except HUB_FAILURES as e:
         raise HubUnreachableError(
             f"cannot push {dataset.repo_id} ({type(e).__name__}: {e}). Check the connection and `hf auth login`; the "
             f"labelled copy in {dataset.root} is whole, push it again later"

@@ -4,8 +4,11 @@ import logging
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from lerobot_latentsafe.decision import FilterDecision, Reason
+from lerobot_latentsafe.runtime.files import replacing
 
 logger = logging.getLogger(__name__)
 
@@ -57,30 +60,23 @@ class Journal:
 
     def write(self) -> None:
         """Replace the file at once by what is known; a failure to write is logged, for the robot must go on."""
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
         rows = [row for _, episode in sorted(self.episodes.items()) for row in episode]
         if not rows:
             return
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            unfinished = self.path.with_suffix(".tmp")
-            pq.write_table(pa.Table.from_pylist(rows), unfinished)
-            unfinished.replace(self.path)
+            with replacing(self.path) as partial:
+                pq.write_table(pa.Table.from_pylist(rows), partial)
         except OSError as e:
             logger.error("decisions were not written to %s (%s); they are kept and tried again", self.path, e)
 
 
-def _read(path: Path):
+def _read(path: Path) -> pa.Table:
     """The table of a journal.
 
     Raises:
         ValueError: torn, or not a journal.
     """
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     try:
         return pq.read_table(path)
     except (pa.ArrowInvalid, OSError) as e:

@@ -1,14 +1,12 @@
 """Whole episodes of a dataset, camera by camera: what the page, the filter and automatic labellers look at."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 import pyarrow.parquet as pq
-
-if TYPE_CHECKING:
-    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.datasets.video_utils import decode_video_frames
 
 MAX_HEIGHT = 480
 """Rows of a frame sent to the page."""
@@ -22,7 +20,7 @@ class DatasetFrames:
         FileNotFoundError: a file of an episode is missing.
     """
 
-    def __init__(self, meta: "LeRobotDatasetMetadata"):
+    def __init__(self, meta: LeRobotDatasetMetadata):
         self.meta, self.root = meta, Path(meta.root)
         self.cameras = [k for k in meta.camera_keys if k not in meta.depth_keys]
         if not self.cameras:
@@ -74,8 +72,6 @@ class DatasetFrames:
         return [image["bytes"] or (self.root / image["path"]).read_bytes() for image in stored]
 
     def _decode_video(self, camera: str, episode: int) -> np.ndarray:
-        from lerobot.datasets.video_utils import decode_video_frames
-
         row, fps = self.meta.episodes[episode], self.meta.fps
         times = row[f"videos/{camera}/from_timestamp"] + np.arange(row["length"]) / fps
         path = self.root / self.meta.get_video_file_path(episode, camera)

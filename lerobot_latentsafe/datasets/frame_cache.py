@@ -6,19 +6,15 @@ model's resolution, or a frozen encoder's tokens. `lerobot-train --dataset.root=
 cut the same way as LeRobot cuts them, so the losses equal those of decoding.
 """
 
-import functools
 import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from torch import Tensor
-
-if TYPE_CHECKING:
-    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
 FOLDER, MANIFEST, BASIS, VERSION = "frame_cache", "manifest.json", "basis.safetensors", 2
 
@@ -27,49 +23,7 @@ class FrameCacheError(ValueError):
     """A frame cache that is torn, of another dataset, resolution or encoder."""
 
 
-def to_model_images(images: Tensor, size: int) -> Tensor:
-    """What every path into a world model does to images: area-average to (size, size), round to 8 bits.
-
-    Args:
-        images: (..., 3, H, W), uint8 or float in [0, 1].
-
-    Returns:
-        float (..., 3, size, size) in [0, 1].
-    """
-    scale, images = (1.0, images.float()) if images.dtype == torch.uint8 else (255.0, images)
-    if images.shape[-2:] != (size, size):
-        rows, columns = (_averages(n, size).to(images) for n in images.shape[-2:])
-        images = rows @ images @ columns.T
-    return (images * scale + 1e-3).round() / 255.0  # the offset keeps x.5 from rounding by float noise
-
-
-@functools.cache
-def _averages(n: int, size: int) -> Tensor:
-    """(size, n): averages of a line's numbers over equal parts, as in interpolation by area, which is slower."""
-    weights = torch.zeros(size, n)
-    for i in range(size):
-        first, end = i * n // size, -(-(i + 1) * n // size)
-        weights[i, first:end] = 1 / (end - first)
-    return weights
-
-
-def check_proportions(key: str, shape: tuple[int, ...], trained: tuple[int, ...]) -> None:
-    """Pictures of any size are averaged to the model's, but not stretched: refuse other proportions than in training.
-
-    Args:
-        shape, trained: (C, H, W) of the pictures now and of those that the filter was trained on.
-
-    Raises:
-        ValueError: naming both.
-    """
-    if len(shape) != 3 or shape[0] != trained[0] or shape[1] * trained[2] != shape[2] * trained[1]:
-        raise ValueError(
-            f"{key} has shape {tuple(shape)}, the filter was trained on {tuple(trained)} (channels, height, width); "
-            "crop the pictures to these proportions, or train a filter on data of this camera"
-        )
-
-
-def dataset_fingerprint(meta: "LeRobotDatasetMetadata") -> str:
+def dataset_fingerprint(meta: LeRobotDatasetMetadata) -> str:
     """Identifies a dataset by all but its cameras, so that a copy without images has the same one."""
     features = {k: [v["dtype"], list(v["shape"])] for k, v in meta.features.items() if k not in meta.camera_keys}
     statistics = {
@@ -99,7 +53,7 @@ class FrameCache:
     manifest: dict
 
     @classmethod
-    def open(cls, root: str | Path, meta: "LeRobotDatasetMetadata | None" = None) -> "FrameCache":
+    def open(cls, root: str | Path, meta: LeRobotDatasetMetadata | None = None) -> "FrameCache":
         """Open the cache in a dataset's folder, checking it against the dataset's metadata.
 
         Raises:

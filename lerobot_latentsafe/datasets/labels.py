@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import os
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -11,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+
+from lerobot_latentsafe.runtime.files import replacing
 
 FAILING, SAFE, UNLABELLED = 1, 0, -1
 FOLDER, SCHEMA, METADATA = "labels", 1, b"latentsafe_labels"
@@ -130,7 +131,7 @@ class Sidecar:
             )
         sidecar = cls.empty(n)
         failure = _to_numpy(table["failure"].combine_chunks())
-        sidecar.failure[index] = _as_labels(failure, covered, str(path))
+        sidecar.failure[index] = as_labels(failure, covered, str(path))
         if "labelled_by" in table.column_names:
             column = table["labelled_by"].combine_chunks()
             column = column if pa.types.is_dictionary(column.type) else column.dictionary_encode()
@@ -170,33 +171,14 @@ class Sidecar:
                 "labelled_at": pa.array(self.at, pa.timestamp("us", "UTC"), mask=self.at == 0),
             }
         ).replace_schema_metadata({METADATA: json.dumps(described)})
-        partial = path.with_name(f".{path.name}.partial")
-        try:
-            with partial.open("wb") as file:
-                pq.write_table(
-                    table,
-                    file,
-                    use_dictionary=["labelled_by", "labelled_at"],
-                    column_encoding={"index": "DELTA_BINARY_PACKED"},
-                    compression="zstd",
-                )
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(partial, path)
-        except BaseException:
-            partial.unlink(missing_ok=True)
-            raise
-        _sync_folder(path.parent)
-
-
-def _sync_folder(folder: Path) -> None:
-    """Make a rename survive a power cut, where the system knows how."""
-    if hasattr(os, "O_DIRECTORY"):
-        descriptor = os.open(folder, os.O_DIRECTORY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+        with replacing(path) as partial:
+            pq.write_table(
+                table,
+                partial,
+                use_dictionary=["labelled_by", "labelled_at"],
+                column_encoding={"index": "DELTA_BINARY_PACKED"},
+                compression="zstd",
+            )
 
 
 @dataclass
@@ -228,12 +210,12 @@ class FailureLabels:
         n, episode = len(data["index"]), data["episode_index"].astype(np.int64)
         terminal = np.full(n, UNLABELLED, np.int8)
         if "next.done" in data:
-            terminal = _as_labels(data["next.done"], n, f"column 'next.done' of {root}")
+            terminal = as_labels(data["next.done"], n, f"column 'next.done' of {root}")
         sidecar = sidecar_path(root, specification)
         if sidecar.exists():
             failure = Sidecar.read(sidecar, data).failure
         elif specification in data:
-            failure = _as_labels(data[specification], n, f"column {specification!r} of {root}")
+            failure = as_labels(data[specification], n, f"column {specification!r} of {root}")
         else:
             columns = pq.ParquetFile(next(root.glob("data/*/*.parquet"))).schema_arrow.names
             raise UnlabelledDatasetError(
@@ -259,7 +241,7 @@ class FailureLabels:
         return float((self.failure == FAILING).sum() / (self.failure != UNLABELLED).sum())
 
 
-def _as_labels(values: np.ndarray, n: int, source: str) -> np.ndarray:
+def as_labels(values: np.ndarray, n: int, source: str) -> np.ndarray:
     """Exactly -1, 0 or 1 for each of n frames: what is cast to int8 unchecked could turn into "safe"."""
     if values.shape == (n, 1):
         values = values[:, 0]

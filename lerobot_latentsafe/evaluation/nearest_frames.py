@@ -1,26 +1,23 @@
 """Frames that were seen, to illustrate what a world model imagines but cannot draw."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import torch
 from torch import Tensor
 
+from lerobot_latentsafe.datasets.episodes import DatasetFrames
+from lerobot_latentsafe.evaluation.along_episodes import check_fit
 from lerobot_latentsafe.latent import Latent
-
-if TYPE_CHECKING:
-    from lerobot_latentsafe.datasets.episodes import DatasetFrames
-    from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+from lerobot_latentsafe.safety_model import SafetyModel
 
 EPISODES, FRAMES = 40, 2000
 """Of a dataset, at most so many episodes and frames are put in, evenly spread."""
 
 
-class Album:
+class NearestFrames:
     """Pictures with what a filter's world model perceives in them, looked through for the one most like a latent."""
 
-    def __init__(self, policy: "LatentSafePolicy"):
-        self.policy = policy
+    def __init__(self, model: SafetyModel):
+        self.model = model
         self.pictures: list[np.ndarray] = []
         self._seen: list[tuple[dict[str, Tensor], Tensor]] = []
 
@@ -36,27 +33,23 @@ class Album:
             images: camera key -> (N, C, H, W), uint8 or in [0, 1]: all that the filter sees of them.
             state: (N, S) in robot units.
         """
-        policy, model = self.policy, self.policy.world_model
-        images = {key: policy.model_images(images[key].to(policy.device)) for key in model.image_keys}
-        self._seen.append((model.perceive(images), policy.normalise_state(state.to(policy.device))))
+        self._seen.append(self.model.see({**images, "observation.state": state}))
         self.pictures += pictures
 
-    def add_dataset(self, frames: "DatasetFrames") -> None:
+    def add_dataset(self, frames: DatasetFrames) -> None:
         """Put a sample of a recorded dataset in.
 
         Raises:
             ValueError: it was recorded with another robot, rate or camera than the filter's.
         """
-        from lerobot_latentsafe.evaluation.along_episodes import check_fit
-
-        check_fit(self.policy, frames)
+        check_fit(self.model, frames)
         total = frames.meta.total_episodes
         step = -(-min(EPISODES, total) * frames.meta.total_frames // (total * FRAMES))
         for episode in np.unique(np.linspace(0, total - 1, min(EPISODES, total)).round().astype(int)).tolist():
-            images = {key: frames.images(key, episode)[::step] for key in self.policy.world_model.image_keys}
+            images = {key: frames.images(key, episode)[::step] for key in self.model.world_model.image_keys}
             state = torch.from_numpy(frames.columns(episode, ["observation.state"])["observation.state"][::step])
             tensors = {key: torch.from_numpy(i).permute(0, 3, 1, 2).contiguous() for key, i in images.items()}
-            self.add(list(images[self.policy.config.cameras[0]]), tensors, state)
+            self.add(list(images[self.model.config.trained_on.cameras[0]]), tensors, state)
 
     @torch.no_grad()
     def nearest(self, latent: Latent) -> np.ndarray:
@@ -66,12 +59,12 @@ class Album:
             latent: (1, ...).
 
         Raises:
-            ValueError: the album is empty.
+            ValueError: there are no frames.
         """
         if not self._seen:
             raise ValueError("no frames to choose from: give --dataset.repo_id, or episodes to film")
         errors = []
         for percepts, state in self._seen:
             repeated = {key: t.expand(len(state), *t.shape[1:]) for key, t in latent.items()}
-            errors.append(self.policy.world_model.error(repeated, percepts, state))
+            errors.append(self.model.world_model.error(repeated, percepts, state))
         return self.pictures[int(torch.cat(errors).argmin())]

@@ -13,7 +13,7 @@ from lerobot_latentsafe.datasets.clips import Clip, ClipReader
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE
 from lerobot_latentsafe.evaluation.statistics import wilson
 from lerobot_latentsafe.latent import Belief, Latent, select
-from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+from lerobot_latentsafe.safety_model import SafetyModel
 
 HORIZONS = (1, 5, 10)
 OBSERVED = 4
@@ -23,7 +23,7 @@ AHEAD = 15
 
 
 def evaluate_world_model(
-    policy: LatentSafePolicy, reader: ClipReader, episodes: np.ndarray, seed: int = 0, n_windows: int = 1024,
+    model: SafetyModel, reader: ClipReader, episodes: np.ndarray, seed: int = 0, n_windows: int = 1024,
     horizon: int = 30,
 ) -> dict:  # fmt: skip
     """Every number of `latentsafe eval-world-model`, on held-out episodes.
@@ -35,27 +35,27 @@ def evaluate_world_model(
         horizon: steps of an episode that are imagined.
     """
     generator = torch.Generator().manual_seed(seed)
-    policy.eval()
+    model.eval()
     return {
-        "errors": prediction_errors(policy, reader, episodes, n_windows, generator),
-        "margin": margin_quality(policy, reader, episodes, n_windows, generator),
-        "episodes": imagined_episodes(policy, reader, episodes, generator, horizon),
-        "along": foreseen_along(policy, reader, episodes),
+        "errors": prediction_errors(model, reader, episodes, n_windows, generator),
+        "margin": margin_quality(model, reader, episodes, n_windows, generator),
+        "episodes": imagined_episodes(model, reader, episodes, generator, horizon),
+        "along": foreseen_along(model, reader, episodes),
     }
 
 
 @torch.no_grad()
 def prediction_errors(
-    policy: LatentSafePolicy, reader: ClipReader, episodes: np.ndarray, n: int, generator: torch.Generator
+    model: SafetyModel, reader: ClipReader, episodes: np.ndarray, n: int, generator: torch.Generator
 ) -> dict:
     """Squared errors of imagined percepts at each horizon, and how much worse shuffled actions or copying are."""
-    clip = _windows(policy, reader, episodes, n, OBSERVED + max(HORIZONS), generator)
-    start = _filtered(policy, clip)
+    clip = _windows(model, reader, episodes, n, OBSERVED + max(HORIZONS), generator)
+    start = _filtered(model, clip)
     shuffled = torch.randperm(len(clip.action), generator=generator)
     errors = {
-        "true": _errors(policy, start, clip, clip.action),
-        "shuffled": _errors(policy, start, clip, clip.action[shuffled]),
-        "copied": _errors(policy, start, clip, None),
+        "true": _errors(model, start, clip, clip.action),
+        "shuffled": _errors(model, start, clip, clip.action[shuffled]),
+        "copied": _errors(model, start, clip, None),
     }
     return {
         f"step {h}": {name: float(error[h - 1]) for name, error in errors.items()}
@@ -64,29 +64,29 @@ def prediction_errors(
     }
 
 
-def _errors(policy: LatentSafePolicy, latent: Latent, clip: Clip, action: Tensor | None) -> Tensor:
+def _errors(model: SafetyModel, latent: Latent, clip: Clip, action: Tensor | None) -> Tensor:
     """Mean error after each imagined step; without actions, of the last latent seen."""
     rows = []
     for t in range(OBSERVED, clip.state.shape[1]):
         if action is not None:
-            latent = policy.world_model.step(latent, action[:, t])
+            latent = model.world_model.step(latent, action[:, t])
         percepts = {key: value[:, t] for key, value in clip.percepts.items()}
-        rows.append(policy.world_model.error(latent, percepts, clip.state[:, t]).mean())
+        rows.append(model.world_model.error(latent, percepts, clip.state[:, t]).mean())
     return torch.stack(rows)
 
 
 @torch.no_grad()
 def margin_quality(
-    policy: LatentSafePolicy, reader: ClipReader, episodes: np.ndarray, n: int, generator: torch.Generator
+    model: SafetyModel, reader: ClipReader, episodes: np.ndarray, n: int, generator: torch.Generator
 ) -> dict:
     """Balanced accuracy of l < 0 on latents of frames that were seen, and on latents imagined so many steps ahead."""
-    clip = _windows(policy, reader, episodes, n, OBSERVED + max(HORIZONS), generator)
-    latent = _filtered(policy, clip)
-    margin = lambda: policy.imagination.margin(latent).cpu().numpy()  # noqa: E731
+    clip = _windows(model, reader, episodes, n, OBSERVED + max(HORIZONS), generator)
+    latent = _filtered(model, clip)
+    margin = lambda: model.imagination.margin(latent).cpu().numpy()  # noqa: E731
     failure = clip.failure.cpu().numpy()
     row = {"seen": balanced_accuracy(margin() < 0, failure[:, OBSERVED - 1])}
     for h in range(1, max(HORIZONS) + 1):
-        latent = policy.world_model.step(latent, clip.action[:, OBSERVED - 1 + h])
+        latent = model.world_model.step(latent, clip.action[:, OBSERVED - 1 + h])
         if h in HORIZONS:
             row[f"imagined {h}"] = balanced_accuracy(margin() < 0, failure[:, OBSERVED - 1 + h])
     return row
@@ -94,7 +94,7 @@ def margin_quality(
 
 @torch.no_grad()
 def imagined_episodes(
-    policy: LatentSafePolicy, reader: ClipReader, episodes: np.ndarray, generator: torch.Generator, horizon: int
+    model: SafetyModel, reader: ClipReader, episodes: np.ndarray, generator: torch.Generator, horizon: int
 ) -> dict:
     """Imagine the recorded actions of each episode from its first frame alone, and compare with what happened.
 
@@ -105,29 +105,31 @@ def imagined_episodes(
         verdicts: balanced accuracy of "fails within `horizon` steps"; shuffled: the same under other episodes' actions;
         false_alarms: of the episodes that do not fail; hold_false_alarms: of holding still instead.
     """
-    clip = _from_the_start(policy, reader, episodes, horizon + 1)
+    clip = _from_the_start(model, reader, episodes, horizon + 1)
     kept = clip.failure[:, 0] == SAFE
     failed = ((clip.failure == FAILING) & clip.valid).any(1)[kept].cpu().numpy()
     percepts = {key: value[kept, 0] for key, value in clip.percepts.items()}
-    start = policy.world_model.observe(None, clip.action[kept, 0], percepts, clip.state[kept, 0])
+    start = model.world_model.observe(None, clip.action[kept, 0], percepts, clip.state[kept, 0])
     action, valid = clip.action[kept, 1:], clip.valid[kept, 1:]
     shuffled = torch.randperm(len(action), generator=generator)
-    still = torch.where(policy.kept, clip.action[kept, :1], policy.normalise_action(policy.hold_action(1)))
-    verdict = _fails(policy, start, action, valid)
+    still = torch.where(
+        model.units.frozen, clip.action[kept, :1], model.units.normalise_action(model.units.hold_action(1))
+    )
+    verdict = _fails(model, start, action, valid)
     return {
         "failing": int(failed.sum()),
         "safe": int((~failed).sum()),
         "verdicts": balanced_accuracy(verdict, failed),
-        "shuffled": balanced_accuracy(_fails(policy, start, action[shuffled], valid[shuffled]), failed),
+        "shuffled": balanced_accuracy(_fails(model, start, action[shuffled], valid[shuffled]), failed),
         "false_alarms": wilson(int(verdict[~failed].sum()), int((~failed).sum())),
         "hold_false_alarms": wilson(
-            int(_fails(policy, start, still.expand_as(action), torch.ones_like(valid)).sum()), len(failed)
+            int(_fails(model, start, still.expand_as(action), torch.ones_like(valid)).sum()), len(failed)
         ),
     }
 
 
 @torch.no_grad()
-def foreseen_along(policy: LatentSafePolicy, reader: ClipReader, episodes: np.ndarray) -> dict:
+def foreseen_along(model: SafetyModel, reader: ClipReader, episodes: np.ndarray) -> dict:
     """From every other state along each episode, known as a filter knows it, imagine the recorded actions.
 
     What a filter has seen grows with the episode, which what it was trained on did not.
@@ -137,16 +139,14 @@ def foreseen_along(policy: LatentSafePolicy, reader: ClipReader, episodes: np.nd
         false_alarms: of these, or None where there are none.
     """
     longest = max(int((reader.labels.episode == e).sum()) for e in episodes)
-    clip, belief, verdicts, outcomes = _from_the_start(policy, reader, episodes, longest), Belief(), [], []
+    clip, belief, verdicts, outcomes = _from_the_start(model, reader, episodes, longest), Belief(), [], []
     for t in range(longest - AHEAD):
-        belief = belief.after(lambda latent: _seen(policy, latent, clip, t), policy.config.memory)  # noqa: B023
+        belief = belief.after(lambda latent: _seen(model, latent, clip, t), model.config.law.history_frames)  # noqa: B023
         kept = (clip.failure[:, t] == SAFE) & clip.valid[:, t + AHEAD]
         if t % 2 or not kept.any():
             continue
         coming = slice(t + 1, t + 1 + AHEAD)
-        verdicts.append(
-            _fails(policy, select(belief.latent, kept), clip.action[kept, coming], clip.valid[kept, coming])
-        )
+        verdicts.append(_fails(model, select(belief.latent, kept), clip.action[kept, coming], clip.valid[kept, coming]))
         outcomes.append((clip.failure[kept, coming] == FAILING).any(1).cpu().numpy())
     verdict, failed = (np.concatenate([*rows, np.zeros(0, bool)]) for rows in (verdicts, outcomes))
     return {
@@ -157,25 +157,25 @@ def foreseen_along(policy: LatentSafePolicy, reader: ClipReader, episodes: np.nd
     }
 
 
-def _from_the_start(policy: LatentSafePolicy, reader: ClipReader, episodes: np.ndarray, length: int) -> Clip:
+def _from_the_start(model: SafetyModel, reader: ClipReader, episodes: np.ndarray, length: int) -> Clip:
     """The first frames of each episode."""
     first = np.array([np.flatnonzero(reader.labels.episode == e)[0] for e in episodes])
-    return reader.cut(first, policy, length=length)
+    return reader.cut(first, model.world_model.percept_names, length=length)
 
 
-def _seen(policy: LatentSafePolicy, latent: Latent | None, clip: Clip, t: int) -> Latent:
+def _seen(model: SafetyModel, latent: Latent | None, clip: Clip, t: int) -> Latent:
     """The posterior after frame t of clips."""
-    action = clip.action[:, t] if latent is not None else policy.first_action(clip.action[:, t])
+    action = clip.action[:, t] if latent is not None else model.units.first_action(clip.action[:, t])
     percepts = {key: value[:, t] for key, value in clip.percepts.items()}
-    return policy.world_model.observe(latent, action, percepts, clip.state[:, t])
+    return model.world_model.observe(latent, action, percepts, clip.state[:, t])
 
 
-def _fails(policy: LatentSafePolicy, latent: Latent, action: Tensor, valid: Tensor) -> np.ndarray:
+def _fails(model: SafetyModel, latent: Latent, action: Tensor, valid: Tensor) -> np.ndarray:
     """Whether l < 0 at any imagined step."""
     fails = torch.zeros(len(action), dtype=torch.bool, device=action.device)
     for t in range(action.shape[1]):
-        latent = policy.world_model.step(latent, action[:, t])
-        fails |= (policy.imagination.margin(latent) < 0) & valid[:, t]
+        latent = model.world_model.step(latent, action[:, t])
+        fails |= (model.imagination.margin(latent) < 0) & valid[:, t]
     return fails.cpu().numpy()
 
 
@@ -188,7 +188,7 @@ def balanced_accuracy(predicted: np.ndarray, truth: np.ndarray) -> float:
 
 
 def _windows(
-    policy: LatentSafePolicy, reader: ClipReader, episodes: np.ndarray, n: int, length: int, generator: torch.Generator
+    model: SafetyModel, reader: ClipReader, episodes: np.ndarray, n: int, length: int, generator: torch.Generator
 ) -> Clip:
     """Random windows that lie within an episode."""
     index = np.flatnonzero(np.isin(reader.labels.episode, episodes))
@@ -197,12 +197,12 @@ def _windows(
     if not len(inside):
         raise ValueError(f"no episode has {length} frames, which the errors at {HORIZONS} steps need")
     picked = torch.randint(len(inside), (n,), generator=generator).numpy()
-    return reader.cut(inside[picked], policy, length=length)
+    return reader.cut(inside[picked], model.world_model.percept_names, length=length)
 
 
-def _filtered(policy: LatentSafePolicy, clip: Clip) -> Latent:
+def _filtered(model: SafetyModel, clip: Clip) -> Latent:
     """The latent after the first OBSERVED frames of each window."""
     latent = None
     for t in range(OBSERVED):
-        latent = _seen(policy, latent, clip, t)
+        latent = _seen(model, latent, clip, t)
     return latent

@@ -14,6 +14,7 @@ from collections import OrderedDict
 from pathlib import Path
 from urllib.parse import urlsplit
 
+import uvicorn
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
@@ -274,8 +275,6 @@ def listen(host: str, port: int) -> socket.socket:
 
 def serve(server: LabelServer, listener: socket.socket) -> None:
     """Serve until interrupted; prints the address to open."""
-    import uvicorn
-
     host, port = listener.getsockname()[:2]
     token, shown = secrets.token_urlsafe(16), f"[{host}]" if ":" in host else host
     print(f"Label at http://{shown}:{port}/{token}/ (every key is saved; Ctrl-C stops)", flush=True)

@@ -1,7 +1,7 @@
 """Labels without a person: plug-in functions that look at an episode and say where it fails.
 
 A labeller is any function `Episode -> first failing frame | labels of all frames | None for "cannot tell"`. One is
-named on the command line as `dubins_truth` (here) or `my_module:my_function`; `vision_language` asks a model.
+named on the command line as `dubins_truth` or `my_module:my_function`; `vision_language` asks a model.
 """
 
 import base64
@@ -14,7 +14,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import cv2
+import httpx
 import numpy as np
+from tqdm import tqdm
 
 from lerobot_latentsafe.datasets.episodes import DatasetFrames
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE, UNLABELLED
@@ -50,13 +52,8 @@ class Episode:
 
 Labeller = Callable[[Episode], "int | np.ndarray | None"]
 
-
-def dubins_truth(episode: Episode) -> np.ndarray:
-    """Privileged simulation truth: the car fails where its recorded position is inside the disc."""
-    from lerobot_latentsafe.dubins import car
-
-    position = episode.column("observation.environment_state")
-    return np.where(np.hypot(*position.T) < car.RADIUS, FAILING, SAFE)
+NAMED = {"dubins_truth": "lerobot_latentsafe.dubins.labeller:dubins_truth"}
+"""Labellers that come with the package: name -> module:function."""
 
 
 # -- a vision-language model ---
@@ -144,8 +141,6 @@ class ChatEndpoint:
     timeout_s: float = 120.0
 
     def __call__(self, prompt: str, pictures: list[np.ndarray]) -> str:
-        import httpx
-
         images = [{"type": "image_url", "image_url": {"url": _data_url(picture)}} for picture in pictures]
         content = [{"type": "text", "text": prompt}, *images]
         asked = {"model": self.model, "temperature": 0, "messages": [{"role": "user", "content": content}]}
@@ -172,21 +167,19 @@ def _data_url(picture: np.ndarray) -> str:
 
 
 def find_labeller(name: str) -> Labeller:
-    """A labeller of this module, or `module:function` of a module that is installed or in the present folder.
+    """A labeller of NAMED, or `module:function` of a module that is installed or in the present folder.
 
     Raises:
         ValueError: there is none of that name.
     """
-    if name == "dubins_truth":
-        return dubins_truth
-    module, _, function = name.partition(":")
+    module, _, function = NAMED.get(name, name).partition(":")
     if (here := os.getcwd()) not in sys.path:  # a console command's own folder is searched, not the user's
         sys.path.append(here)
     try:
         return getattr(importlib.import_module(module), function)
     except (ImportError, AttributeError, ValueError) as e:
         raise ValueError(
-            f"no labeller {name!r} ({e}); expected dubins_truth, vision_language, or module:function"
+            f"no labeller {name!r} ({e}); expected {', '.join(NAMED)}, vision_language, or module:function"
         ) from e
 
 
@@ -198,8 +191,6 @@ def label_automatically(
     Returns:
         labelled: episodes; undecided: episodes; refused: (episode, why) of answers that were no labels.
     """
-    from tqdm import tqdm
-
     open_episodes = [e for e in range(len(store)) if (store.labels(specification, e) == UNLABELLED).all()]
     found, result = {}, {"labelled": [], "undecided": [], "refused": []}
     for number in tqdm(open_episodes, desc=name, unit="episode"):

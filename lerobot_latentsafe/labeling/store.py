@@ -21,7 +21,7 @@ from lerobot_latentsafe.datasets.labels import (
     UNLABELLED,
     Sidecar,
     UnlabelledDatasetError,
-    _as_labels,
+    as_labels,
     identity,
     read_frames,
     sidecar_path,
@@ -88,7 +88,7 @@ class LabelStore:
         sidecar = Sidecar.empty(len(self.frames["index"]))
         if name in self.frames:
             # What the dataset says already is where labelling starts.
-            sidecar.failure = _as_labels(self.frames[name], len(sidecar.failure), f"column {name!r} of {self.root}")
+            sidecar.failure = as_labels(self.frames[name], len(sidecar.failure), f"column {name!r} of {self.root}")
             sidecar.names, sidecar.by[sidecar.failure != UNLABELLED] = [f"column {name}"], 0
         return sidecar
 

@@ -1,20 +1,20 @@
 """What a trained filter's margin says about episodes: a guess, an order of usefulness, labels that look wrong."""
 
 import multiprocessing
+import os
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
 from lerobot_latentsafe.datasets.episodes import DatasetFrames
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE
 from lerobot_latentsafe.evaluation.along_episodes import episode_margins
-
-if TYPE_CHECKING:
-    pass
+from lerobot_latentsafe.modeling_latentsafe import load_filter
 
 WORST = 5
 """Frames an episode is judged by: a short doubt in a long certain episode counts."""
@@ -101,20 +101,12 @@ class Suggester:
 
 def _judge(policy_path: str, repo_id: str, root: str, sender) -> None:
     """The other process: sends (episode, margin), or why it cannot."""
-    import os
-
     if hasattr(os, "nice"):
         os.nice(10)
     try:
-        import torch
-        from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-
-        import lerobot_latentsafe  # noqa: F401  (registers the policy type)
-        from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
-
         torch.set_num_threads(1)
-        policy = LatentSafePolicy.from_pretrained(policy_path).eval()
-        for answer in episode_margins(policy, DatasetFrames(LeRobotDatasetMetadata(repo_id, root=root))):
+        model = load_filter(policy_path).model
+        for answer in episode_margins(model, DatasetFrames(LeRobotDatasetMetadata(repo_id, root=root))):
             sender.send(answer)
     except BrokenPipeError:
         return

@@ -10,7 +10,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from lerobot_latentsafe.dubins import car
-from lerobot_latentsafe.evaluation.statistics import Episodes, wilson
+from lerobot_latentsafe.evaluation.rollouts import Episodes
+from lerobot_latentsafe.evaluation.statistics import wilson
 
 
 def save(figure: Figure, path: str | Path) -> None:

@@ -1,5 +1,6 @@
 """The report on a filter: what it is, what it changes, and what it saw and feared when it acted."""
 
+from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -9,23 +10,21 @@ from lerobot.envs.configs import EnvConfig
 
 from lerobot_latentsafe.datasets.episodes import DatasetFrames
 from lerobot_latentsafe.decision import Reason
-from lerobot_latentsafe.evaluation.nearest_frames import Album
-from lerobot_latentsafe.evaluation.statistics import (
-    Episodes,
-    check_environment,
-    compare,
-    count_reasons,
-    provenance,
-    wilson,
-)
+from lerobot_latentsafe.evaluation.nearest_frames import NearestFrames
+from lerobot_latentsafe.evaluation.rollouts import Episodes, check_environment, compare, count_reasons
+from lerobot_latentsafe.evaluation.statistics import provenance, wilson
 from lerobot_latentsafe.latent import Latent
-from lerobot_latentsafe.model_card import fallback, threshold
+from lerobot_latentsafe.model_card import fallback, rate_in_words, threshold
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.reports import figures, html
-from lerobot_latentsafe.reports.recorded_episodes import Recording
+from lerobot_latentsafe.reports.recorded_episodes import RecordedEpisodes
 
 SHOWN, LOOKED_THROUGH, IMAGINED, PRINTED = 3, 12, 16, 8
 """Episodes shown, among how many they are picked, steps of imagination, pictures on paper."""
+
+Extra = Callable[[LatentSafePolicy, dict | None, Path], list[str]]
+"""What a study adds to the report on its environment: filter, comparison (see `compare`) or None, and a folder for
+pictures, to parts of the page."""
 
 INTRODUCTION = (
     "A safety filter watches what a robot sees. At every step it imagines, with a model of the world learnt from "
@@ -37,7 +36,7 @@ INTRODUCTION = (
 
 def write_filter_report(
     path: Path, policy: LatentSafePolicy, env: EnvConfig | None, n_episodes: int, seed: int,
-    recorded: DatasetFrames | None = None,
+    recorded: DatasetFrames | None = None, extra: Extra | None = None,
 ) -> None:  # fmt: skip
     """Write the report.
 
@@ -45,25 +44,26 @@ def write_filter_report(
         env: with a base policy, the policy is run there first, bare and shielded from the same starts.
         recorded: a dataset; what `latentsafe record` stored is shown, and where the world model cannot draw, its frames
             illustrate what was imagined, beside those of the episodes that are run.
+        extra: what to add of the environment.
 
     Raises:
         ValueError: nothing is run, and the dataset was not recorded under a filter.
     """
-    policy.require_stage(policy.needed_stage)
-    if recorded is not None and env is None and not Recording.is_one(recorded):
+    policy.model.require_trained_for_law()
+    if recorded is not None and env is None and not RecordedEpisodes.is_one(recorded):
         raise ValueError(
             f"{recorded.meta.repo_id} was not recorded under a filter (latentsafe record), so nothing tells what one "
             "changed; record under it, give --env.type as well, or ask latentsafe check-labels what it thinks of these"
         )
-    album = None if policy.world_model.draws else Album(policy)
-    if album is not None and recorded is not None:
-        album.add_dataset(recorded)
+    seen = None if policy.model.world_model.draws else NearestFrames(policy.model)
+    if seen is not None and recorded is not None:
+        seen.add_dataset(recorded)
     with TemporaryDirectory() as folder:
         parts = [html.paragraph(INTRODUCTION), *_about(policy)]
         if env is not None:
-            parts += _evaluation(policy, env, n_episodes, seed, Path(folder), album)
-        if recorded is not None and Recording.is_one(recorded):
-            parts += _recording(Recording(policy, recorded), Path(folder), album)
+            parts += _evaluation(policy, env, n_episodes, seed, Path(folder), seen, extra)
+        if recorded is not None and RecordedEpisodes.is_one(recorded):
+            parts += _recording(RecordedEpisodes(policy.model, recorded), policy, Path(folder), seen)
         made = provenance(seeds=[seed])
         parts += [
             html.paragraph(
@@ -77,45 +77,46 @@ def write_filter_report(
 
 
 def _evaluation(
-    policy: LatentSafePolicy, env: EnvConfig, n_episodes: int, seed: int, folder: Path, album: Album | None
-) -> list[str]:
+    policy: LatentSafePolicy, env: EnvConfig, n_episodes: int, seed: int, folder: Path,
+    seen: NearestFrames | None, extra: Extra | None,
+) -> list[str]:  # fmt: skip
     """What the filter changes in an environment, and what it knows of it."""
     check_environment(policy, env)
-    parts = []
+    parts, result = [], None
     if policy.base is not None:
-        result = compare(policy, env, n_episodes, seed, min(n_episodes, LOOKED_THROUGH), album)
-        parts += _comparison(result, policy, env, folder)
-        parts += _episodes(result["episodes"], policy, env, folder, album)
-    if env.type == "latentsafe_dubins":
-        parts += _safe_set(policy, folder)
+        result = compare(policy, env, n_episodes, seed, min(n_episodes, LOOKED_THROUGH), seen)
+        parts += _comparison(result, folder)
+        parts += _episodes(result["episodes"], policy, env, folder, seen)
+    if extra is not None:
+        parts += extra(policy, result, folder)
     return parts
 
 
 def _about(policy: LatentSafePolicy) -> list[str]:
-    config, found = policy.config, policy.config.calibration
-    ranges = zip(config.action_names, config.action_low, config.action_high)
+    config, trained_on, found = policy.config, policy.config.trained_on, policy.config.calibration
     evidence = "set by hand"
     if found:
         evidence = (
             f"chosen on {found['failing_episodes']:.0f} failing episodes it had not seen: {found['missed']:.1%} warned "
             f"too late, {found['false_alarms']:.1%} of safe frames alarmed"
         )
+    ranges = [f"{name} from {low:.3g} to {high:.3g}" for name, (low, high) in trained_on.ranges.items()]
     rows = [
-        ["sees", f"{', '.join(config.cameras)}; {', '.join(config.state_names)}"],
-        ["acts on", ", ".join(f"{name} from {low:.3g} to {high:.3g}" for name, low, high in ranges)],
-        ["rate", f"{config.fps} steps a second"],
-        ["failure means", f"the recordings' label {config.failure_specification!r}"],
-        ["threshold", f"epsilon = {threshold(config)}, {evidence}"],
-        ["fallback", fallback(config)],
-        ["mode", "overrides unsafe actions" if config.mode == "filter" else "only watches"],
+        ["sees", f"{', '.join(trained_on.cameras)}; {', '.join(trained_on.state_names)}"],
+        ["acts on", ", ".join(ranges)],
+        ["rate", f"{trained_on.fps} steps a second"],
+        ["failure means", f"the recordings' label {config.margin.failure_specification!r}"],
+        ["threshold", f"epsilon = {threshold(config.law)}, {evidence}"],
+        ["fallback", fallback(config.law)],
+        ["mode", "overrides unsafe actions" if config.law.mode == "filter" else "only watches"],
     ]
     return [html.heading("The filter"), html.table(["", ""], rows)]
 
 
-def _comparison(result: dict, policy: LatentSafePolicy, env: EnvConfig, folder: Path) -> list[str]:
+def _comparison(result: dict, folder: Path) -> list[str]:
     header = ["the policy", "safe success", "failure", "neither"]
     rows = [
-        [name, *(html.share(result[name][key]) for key in ("success", "violation", "incompletion"))]
+        [name, *(rate_in_words(result[name][key]) for key in ("success", "violation", "incompletion"))]
         for name in ("bare", "shielded")
     ]
     shielded, p_value = result["shielded"], result["violation_p_value"]
@@ -130,11 +131,6 @@ def _comparison(result: dict, policy: LatentSafePolicy, env: EnvConfig, folder: 
         ),
         html.table(["why a step was judged as it was", "steps"], list(result["reasons"].items())),
     ]
-    if env.type == "latentsafe_dubins":
-        figures.save(figures.trajectories(result["episodes"]), folder / "paths.png")
-        parts.append(
-            html.picture(folder / "paths.png", "Where the car went. Red entered the disc; orange: the filter acts.")
-        )
     if np.isfinite(result["episodes"]["bare"].severity).all():
         parts += _severity(result["episodes"], folder)
     return parts
@@ -145,7 +141,7 @@ def _severity(runs: dict[str, Episodes], folder: Path) -> list[str]:
     figures.save(figures.severities(runs), folder / "severity.png")
     least = (0.05, 0.25, 0.5, 1.0)
     rows = [
-        [name, *(html.share(wilson((r.severity >= share).sum(), len(r.severity))) for share in least)]
+        [name, *(rate_in_words(wilson((r.severity >= share).sum(), len(r.severity))) for share in least)]
         for name, r in runs.items()
     ]
     return [
@@ -156,20 +152,22 @@ def _severity(runs: dict[str, Episodes], folder: Path) -> list[str]:
 
 
 def _episodes(
-    runs: dict[str, Episodes], policy: LatentSafePolicy, env: EnvConfig, folder: Path, album: Album | None
+    runs: dict[str, Episodes], policy: LatentSafePolicy, env: EnvConfig, folder: Path, seen: NearestFrames | None
 ) -> list[str]:
     side_by_side = "Left without the filter, right with it; an orange frame while the filter acts. "
     parts = [html.heading("Episodes"), html.paragraph(side_by_side + CURVES)]
     for i in _worth_showing(runs["bare"], runs["shielded"]):
         outcome = {name: "fails" if r.violation[i] else "stays safe" for name, r in runs.items()}
         parts.append(f"<h3>Episode {i}: {outcome['bare']} without the filter, {outcome['shielded']} with it</h3>")
-        parts += _played({name: r.only(i) for name, r in runs.items()}, policy, env.fps, folder / f"run_{i}", album)
+        parts += _played({name: r.only(i) for name, r in runs.items()}, policy, env.fps, folder / f"run_{i}", seen)
     return parts
 
 
-def _recording(recording: Recording, folder: Path, album: Album | None) -> list[str]:
+def _recording(
+    recording: RecordedEpisodes, policy: LatentSafePolicy, folder: Path, seen: NearestFrames | None
+) -> list[str]:
     """The recorded episodes in which the filter acted most."""
-    policy, fps, decisions = recording.policy, recording.frames.meta.fps, recording.decisions
+    fps, decisions = recording.frames.meta.fps, recording.decisions
     acted = np.bincount(recording.episode, decisions["intervened"]).astype(int)
     steps = np.bincount(recording.episode)
     parts = [
@@ -183,7 +181,7 @@ def _recording(recording: Recording, folder: Path, album: Album | None) -> list[
     ]
     for i in np.argsort(-acted, kind="stable")[:SHOWN].tolist():
         parts.append(f"<h3>Episode {i}: the filter acts in {acted[i]} of {steps[i]} steps</h3>")
-        parts += _played({"recorded": recording.read(i)}, policy, fps, folder / f"recorded_{i}", album)
+        parts += _played({"recorded": recording.read(i)}, policy, fps, folder / f"recorded_{i}", seen)
     return parts
 
 
@@ -195,7 +193,7 @@ CURVES = (
 
 
 def _played(
-    runs: dict[str, Episodes], policy: LatentSafePolicy, fps: int, folder: Path, album: Album | None
+    runs: dict[str, Episodes], policy: LatentSafePolicy, fps: int, folder: Path, seen: NearestFrames | None
 ) -> list[str]:
     """Runs of one episode each, side by side in a video, with the curves and fears of the last, which was filtered."""
     (video,) = figures.write_videos(runs, folder, fps)
@@ -204,7 +202,7 @@ def _played(
     charts, printed = _charts(trace, policy, fps, seconds), _printed(trace, filtered.frames[0], fps)
     return [
         html.player(video, charts, seconds, "", printed),
-        *_feared(trace, filtered.latents[0], policy, fps, album),
+        *_feared(trace, filtered.latents[0], policy, fps, seen),
     ]
 
 
@@ -222,13 +220,13 @@ def _charts(trace: dict[str, list], policy: LatentSafePolicy, fps: int, seconds:
     padded = lambda values: np.r_[np.asarray(values, float), np.full(n - len(values), np.nan)]  # noqa: E731
     shaded = np.r_[acted, np.zeros(n - len(acted), bool)]
     values = {"value of the wanted action": padded(trace["value"]), "margin now": padded(trace["margin"])}
-    charts = [html.chart(values, fps, shaded, policy.config.epsilon, (-1.0, 1.0), "dashed: threshold")]
+    charts = [html.chart(values, fps, shaded, policy.config.law.epsilon, (-1.0, 1.0), "dashed: threshold")]
     proposed, executed = np.array(trace["proposed"]), np.array(trace["action"])
-    limits = list(zip(policy.config.action_low, policy.config.action_high))
-    for j, name in enumerate(policy.config.action_names):
-        if policy.config.action_varies[j]:
+    ranges, varies = policy.config.trained_on.ranges, policy.config.trained_on.action_varies
+    for j, (name, limits) in enumerate(ranges.items()):
+        if varies[j]:
             commands = {f"{name} executed": padded(executed[:, j]), "wanted": padded(proposed[:, j])}
-            charts.append(html.chart(commands, fps, shaded, limits=limits[j]))
+            charts.append(html.chart(commands, fps, shaded, limits=limits))
     return charts
 
 
@@ -239,23 +237,25 @@ def _printed(trace: dict[str, list], frames: list[np.ndarray], fps: int) -> str:
 
 
 def _feared(
-    trace: dict[str, list], latents: list[Latent], policy: LatentSafePolicy, fps: int, album: Album | None
+    trace: dict[str, list], latents: list[Latent], policy: LatentSafePolicy, fps: int, seen: NearestFrames | None
 ) -> list[str]:
     """What the filter imagined when it first acted: the wanted action held on, and its own way out."""
     acted = np.flatnonzero(np.array(trace["reason"]) == Reason.UNSAFE_VALUE)
     if not len(acted):
         return [html.paragraph("The filter never saw a reason to act here.")]
     first = int(acted[0])
-    wanted = policy.normalise_action(torch.tensor([trace["proposed"][first]], device=policy.device)).clamp(-1, 1)
+    wanted = policy.model.units.normalise_action(
+        torch.tensor([trace["proposed"][first]], device=policy.model.device)
+    ).clamp(-1, 1)
     said = f"What the filter imagined when it first acted, {first / fps:.2f} s into the episode:"
-    if album is not None:
+    if seen is not None:
         said += (
             " its world model cannot draw, so each picture is the one, of the "
-            f"{len(album):,} it has seen here, that it holds for most like what it imagines."
+            f"{len(seen):,} it has seen here, that it holds for most like what it imagines."
         )
     parts = [html.paragraph(said)]
     for name, action in (("the wanted action, held on", wanted), ("its own fallback", None)):
-        images, margins = imagine(policy, latents[first], action, album)
+        images, margins = imagine(policy, latents[first], action, seen)
         captions = [f"+{(k + 1) / fps:.2f} s, l = {l:+.2f}" for k, l in enumerate(margins)]
         every = slice(1, None, IMAGINED // PRINTED)
         picture = html.strip(images[every], captions[every], [l < 0 for l in margins[every]])
@@ -265,38 +265,26 @@ def _feared(
 
 @torch.no_grad()
 def imagine(
-    policy: LatentSafePolicy, latent: Latent, action: torch.Tensor | None, album: Album | None = None
+    policy: LatentSafePolicy, latent: Latent, action: torch.Tensor | None, seen: NearestFrames | None = None
 ) -> tuple[list[np.ndarray], list[float]]:
     """Pictures of the first camera and margins of IMAGINED steps from a latent (1, ...).
 
     Args:
         action: (1, A) in [-1, 1], held on; None asks the fallback policy at every step.
-        album: where to look for pictures; None has the world model decode them.
+        seen: where to look for pictures; None has the world model decode them.
     """
-    model, images, margins = policy.world_model, [], []
+    model, images, margins = policy.model.world_model, [], []
     for _ in range(IMAGINED):
-        held = policy.plan(latent)[1] if action is None else action
+        held = policy.model.plan(latent)[1] if action is None else action
         latent = model.step(latent, held)
-        images.append(_decoded(policy, latent) if album is None else album.nearest(latent))
-        margins.append(policy.imagination.margin(latent).item())
+        images.append(_decoded(policy, latent) if seen is None else seen.nearest(latent))
+        margins.append(policy.model.imagination.margin(latent).item())
     return images, margins
 
 
 def _decoded(policy: LatentSafePolicy, latent: Latent) -> np.ndarray:
     """The first camera's picture (H, W, 3), uint8, as the world model draws a latent (1, ...)."""
-    picture = policy.world_model.decode(policy.world_model.features(latent))[policy.config.cameras[0]][0].clamp(0, 1)
+    picture = policy.model.world_model.decode(policy.model.world_model.features(latent))[
+        policy.config.trained_on.cameras[0]
+    ][0].clamp(0, 1)
     return (picture.permute(1, 2, 0).cpu().numpy() * 255).round().astype(np.uint8)
-
-
-def _safe_set(policy: LatentSafePolicy, folder: Path) -> list[str]:
-    from lerobot_latentsafe.experiments.dubins.monitor import LatentMonitor
-
-    figures.save(figures.value_slices({"latent": LatentMonitor(policy)}), folder / "slices.png")
-    return [
-        html.heading("The safe set it learnt from images"),
-        html.picture(
-            folder / "slices.png",
-            "The value over the car's position for two headings. Solid: where the filter draws the line; dashed: the "
-            "exact one, known for this simulated car only.",
-        ),
-    ]

@@ -172,12 +172,6 @@ def _encoded(path: Path) -> str:
     return base64.b64encode(Path(path).read_bytes()).decode()
 
 
-def share(rate: dict[str, float]) -> str:
-    """`12/200 = 6.0% [3.5, 10.2]` from a Wilson record."""
-    k, n = rate["k"], rate["n"]
-    return f"{k}/{n} = {k / n:.1%} [{100 * rate['low']:.1f}, {100 * rate['high']:.1f}]"
-
-
 def write_report(path: str | Path, title: str, parts: list[str]) -> None:
     """Write the page."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)

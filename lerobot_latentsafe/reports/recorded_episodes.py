@@ -6,12 +6,12 @@ from lerobot_latentsafe.datasets.decisions import FILE, decision_columns
 from lerobot_latentsafe.datasets.episodes import DatasetFrames
 from lerobot_latentsafe.datasets.labels import read_frames
 from lerobot_latentsafe.evaluation.along_episodes import check_fit, encode_episodes
-from lerobot_latentsafe.evaluation.statistics import Episodes
+from lerobot_latentsafe.evaluation.rollouts import Episodes
 from lerobot_latentsafe.latent import map_latent
-from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+from lerobot_latentsafe.safety_model import SafetyModel
 
 
-class Recording:
+class RecordedEpisodes:
     """A dataset with the shield's decisions beside it.
 
     Attributes:
@@ -23,9 +23,9 @@ class Recording:
         ValueError: the decisions are another dataset's, or the dataset another robot's than the filter's.
     """
 
-    def __init__(self, policy: LatentSafePolicy, frames: DatasetFrames):
-        check_fit(policy, frames)
-        self.policy, self.frames = policy, frames
+    def __init__(self, model: SafetyModel, frames: DatasetFrames):
+        check_fit(model, frames)
+        self.model, self.frames = model, frames
         stored = read_frames(frames.root, ["frame_index", "action"])
         self.episode, self.executed = stored["episode_index"], stored["action"]
         self.decisions = decision_columns(frames.root / FILE, stored)
@@ -40,11 +40,11 @@ class Recording:
         rows, no = self.episode == episode, np.zeros(1, bool)
         trace = {name: column[rows].tolist() for name, column in self.decisions.items()}
         change = np.linalg.norm(self.executed[rows] - self.decisions["proposed"][rows], axis=-1)
-        latents, (length,) = encode_episodes(self.policy, self.frames, [episode])
+        latents, (length,) = encode_episodes(self.model, self.frames, [episode])
         return Episodes(
             success=no, violation=no, steps=np.array([length]), overridden=np.array([sum(trace["intervened"])]),
             action_change=np.array([change.sum()]), severity=np.full(1, np.nan),
             traces=[{**trace, "action": self.executed[rows].tolist()}],
-            frames=[list(self.frames.images(self.policy.config.cameras[0], episode))],
+            frames=[list(self.frames.images(self.model.config.trained_on.cameras[0], episode))],
             latents=[[map_latent(latents, lambda z, t=t: z[:, t]) for t in range(length)]],
         )  # fmt: skip

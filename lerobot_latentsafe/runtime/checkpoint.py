@@ -92,7 +92,7 @@ def _config_digest(folder: Path, entries: Sequence[str]) -> str:
 
 
 def seal(folder: Path, entries: Sequence[str]) -> None:
-    """Record the hash and size of the weights, and the hash of those entries of the configuration that belong to them."""
+    """Record the hash and size of the weights, and the hash of the configuration's entries that belong to them."""
     file = folder / WEIGHTS
     record = {
         "sha256": _digest(file),

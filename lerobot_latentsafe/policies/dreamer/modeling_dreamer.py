@@ -5,15 +5,19 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from huggingface_hub import ModelCard
 from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor
 
 from lerobot_latentsafe.datasets.clips import Clip
 from lerobot_latentsafe.latent import Latent
-from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, UntrainedFilterError
+from lerobot_latentsafe.model_card import make_task_policy_card
+from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
 from lerobot_latentsafe.policies.dreamer.behavior import Actor, ReturnRange, TwoHotHead, imagine, lambda_returns
 from lerobot_latentsafe.policies.dreamer.configuration_dreamer import LatentSafeDreamerConfig
 from lerobot_latentsafe.runtime.checkpoint import CheckpointError, fitting_weights, read_config, resolve_checkpoint
+from lerobot_latentsafe.runtime.hub import save_policy
+from lerobot_latentsafe.safety_model import SafetyModel, UntrainedFilterError
 
 WORLD_MODEL_FOLDER = "world_model"
 SHARED = ("task", "cameras", "fps", "state_names", "action_names")
@@ -34,13 +38,13 @@ class LatentSafeDreamerPolicy(PreTrainedPolicy):
     config_class = LatentSafeDreamerConfig
     name = "latentsafe_dreamer"
 
-    def __init__(self, config: LatentSafeDreamerConfig, model: LatentSafePolicy | None = None, **kwargs: Any):
+    def __init__(self, config: LatentSafeDreamerConfig, model: SafetyModel | None = None, **kwargs: Any):
         super().__init__(config)
         model = model or _load_world_model(config)
         adopt_world_model(config, model)
         self._model = [model]  # in a list, so that its weights are not ours
         behavior, dim = config.behavior, model.world_model.feature_dim
-        self.actor = Actor(dim, model.action_varies.clone(), behavior)
+        self.actor = Actor(dim, model.units.action_varies.clone(), behavior)
         self.critic, self.reward = TwoHotHead(dim, behavior), TwoHotHead(dim, behavior)
         self.slow_critic = copy.deepcopy(self.critic).requires_grad_(False)
         self.return_range = ReturnRange(behavior.return_rate)
@@ -48,7 +52,7 @@ class LatentSafeDreamerPolicy(PreTrainedPolicy):
         self.reset()
 
     @property
-    def model(self) -> LatentSafePolicy:
+    def model(self) -> SafetyModel:
         """World model, margin and units."""
         return self._model[0]
 
@@ -74,24 +78,22 @@ class LatentSafeDreamerPolicy(PreTrainedPolicy):
     @torch.no_grad()
     def act(self, batch: dict[str, Tensor], explore: bool) -> Tensor:
         """One tick: look, and choose the likeliest action, or a drawn one. (B, A) in robot units."""
-        model = self.model
-        self.require_stage("world_model")
-        images = {key: model.model_images(batch[key].to(model.device)) for key in model.world_model.image_keys}
-        percepts = model.world_model.perceive(images)
-        state = model.normalise_state(batch["observation.state"].to(model.device))
+        model, units = self.model, self.model.units
+        model.require_stage("world_model")
+        percepts, state = model.see(batch)
         first = self.latent is None
         if first:  # what the fingers do is known of every frame that was learned from, so it must be of this one
-            self.executed = model.first_action(model.normalise_action(model.commands_seen(state)).nan_to_num(0.0))
+            self.executed = units.first_action(units.normalise_action(units.commands_seen(state)).nan_to_num(0.0))
         self.latent = model.world_model.observe(self.latent, self.executed, percepts, state)
         features = model.world_model.features(self.latent)
         self.executed = self.actor.sample(features).clamp(-1, 1) if explore else self.actor.mode(features)
         if first:  # what counts as having led to the first frame depends on its action, see `first_action`
-            self.latent = model.world_model.observe(None, model.first_action(self.executed), percepts, state)
-        return model.denormalise_action(self.executed)
+            self.latent = model.world_model.observe(None, units.first_action(self.executed), percepts, state)
+        return units.denormalise_action(self.executed)
 
     def was_overridden(self, executed: Tensor) -> None:
         """Remember what was done, (B, A) in robot units, instead of what was chosen."""
-        self.executed = self.model.normalise_action(executed).clamp(-1, 1)
+        self.executed = self.model.units.normalise_action(executed).clamp(-1, 1)
 
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """A chunk of one: (B, 1, A)."""
@@ -153,9 +155,7 @@ class LatentSafeDreamerPolicy(PreTrainedPolicy):
     # -- files ---
 
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
-        from lerobot_latentsafe.runtime.checkpoint import save_filter
-
-        save_filter(self.model, save_directory / WORLD_MODEL_FOLDER)
+        save_policy(LatentSafePolicy(self.model.config, model=self.model), save_directory / WORLD_MODEL_FOLDER)
         config, path = self.config, self.config.world_model_path
         config.world_model_path = WORLD_MODEL_FOLDER
         try:
@@ -178,11 +178,10 @@ class LatentSafeDreamerPolicy(PreTrainedPolicy):
             return super().from_pretrained(folder, config=config, strict=True, **kwargs)
 
     def generate_model_card(self, dataset_repo_id: str, model_type: str, license: str | None,
-                            tags: list[str] | None, cfg=None, dataset_meta=None):  # fmt: skip
+                            tags: list[str] | None, cfg=None, dataset_meta=None) -> ModelCard:  # fmt: skip
         """A card that says that this policy is a baseline that fails at times."""
-        from lerobot_latentsafe.model_card import make_task_policy_card
-
-        return make_task_policy_card(self.config, dataset_repo_id, license, tags)
+        config = self.config
+        return make_task_policy_card(config.task, config.repo_id or "me/policy", dataset_repo_id, license, tags)
 
 
 def stored_world_model(folder: Path, config: LatentSafeDreamerConfig) -> str | None:
@@ -191,25 +190,23 @@ def stored_world_model(folder: Path, config: LatentSafeDreamerConfig) -> str | N
     return str(folder / path) if path == WORLD_MODEL_FOLDER else path
 
 
-def _load_world_model(config: LatentSafeDreamerConfig) -> LatentSafePolicy:
+def _load_world_model(config: LatentSafeDreamerConfig) -> SafetyModel:
     if config.world_model_path is None:
         raise UntrainedFilterError(
             "this latentsafe_dreamer policy has no world model: train one with latentsafe train-dreamer, or load one "
             "with --policy.path=..."
         )
-    model_config = read_config(resolve_checkpoint(config.world_model_path))
-    model_config.device = config.device
-    return LatentSafePolicy.from_pretrained(config.world_model_path, config=model_config)
+    return load_filter(config.world_model_path, device=config.device).model
 
 
-def adopt_world_model(config: LatentSafeDreamerConfig, model: LatentSafePolicy) -> None:
+def adopt_world_model(config: LatentSafeDreamerConfig, model: SafetyModel) -> None:
     """Take over what the policy sees and does from its world model, or check that they agree.
 
     Raises:
         WorldModelMismatchError: naming what differs.
     """
     for name in SHARED:
-        known, found = getattr(config, name), getattr(model.config, name)
+        known, found = getattr(config, name), getattr(model.config.trained_on, name)
         if known is not None and known != found:
             raise WorldModelMismatchError(
                 f"the world model has {name} = {found}, this policy was trained with {known}; give it the world model "

@@ -1,0 +1,48 @@
+"""What every path into a world model does to pictures, and which pictures it refuses."""
+
+import functools
+
+import torch
+from torch import Tensor
+
+
+def to_model_images(images: Tensor, size: int) -> Tensor:
+    """What every path into a world model does to images: area-average to (size, size), round to 8 bits.
+
+    Args:
+        images: (..., 3, H, W), uint8 or float in [0, 1].
+
+    Returns:
+        float (..., 3, size, size) in [0, 1].
+    """
+    scale, images = (1.0, images.float()) if images.dtype == torch.uint8 else (255.0, images)
+    if images.shape[-2:] != (size, size):
+        rows, columns = (_averages(n, size).to(images) for n in images.shape[-2:])
+        images = rows @ images @ columns.T
+    return (images * scale + 1e-3).round() / 255.0  # the offset keeps x.5 from rounding by float noise
+
+
+@functools.cache
+def _averages(n: int, size: int) -> Tensor:
+    """(size, n): averages of a line's numbers over equal parts, as in interpolation by area, which is slower."""
+    weights = torch.zeros(size, n)
+    for i in range(size):
+        first, end = i * n // size, -(-(i + 1) * n // size)
+        weights[i, first:end] = 1 / (end - first)
+    return weights
+
+
+def check_proportions(key: str, shape: tuple[int, ...], trained: tuple[int, ...]) -> None:
+    """Pictures of any size are averaged to the model's, but not stretched: refuse other proportions than in training.
+
+    Args:
+        shape, trained: (C, H, W) of the pictures now and of those that the filter was trained on.
+
+    Raises:
+        ValueError: naming both.
+    """
+    if len(shape) != 3 or shape[0] != trained[0] or shape[1] * trained[2] != shape[2] * trained[1]:
+        raise ValueError(
+            f"{key} has shape {tuple(shape)}, the filter was trained on {tuple(trained)} (channels, height, width); "
+            "crop the pictures to these proportions, or train a filter on data of this camera"
+        )
