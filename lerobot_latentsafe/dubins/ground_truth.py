@@ -14,6 +14,8 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+from scipy.interpolate import RegularGridInterpolator
+from scipy.ndimage import map_coordinates
 
 from lerobot_latentsafe.dubins import car
 
@@ -67,8 +69,6 @@ def solve_grid(
     Returns:
         V (n, n, n_headings) on [-half_width, half_width]^2 x [0, 2 pi) and the number of sweeps.
     """
-    from scipy.ndimage import map_coordinates
-
     turn_rates = car.TURN_RATES if turn_rates is None else np.asarray(turn_rates)
     grid = ((-half_width, half_width, n), (-half_width, half_width, n), (0.0, 2 * np.pi, n_headings))
     states = grid_states(grid)
@@ -157,8 +157,6 @@ def truth_on(states: np.ndarray | None, truth: str) -> tuple[np.ndarray, np.ndar
     V = solve_continuous()
     if nodes:
         return states, V.reshape(-1)
-    from scipy.interpolate import RegularGridInterpolator
-
     (x0, x1, nx), (y0, y1, ny), (_, h1, nh) = PAPER_GRID
     axes = np.linspace(x0, x1, nx), np.linspace(y0, y1, ny), np.linspace(0, h1, nh + 1)
     periodic = np.concatenate([V, V[..., :1]], -1)
@@ -181,8 +179,6 @@ def load_states(path: str | Path) -> np.ndarray:
 
 def sample_task_start(rng: np.random.Generator, min_value: float = 0.1) -> np.ndarray:
     """A start at the left edge, facing the goal, roughly; safety is feasible with room: V > min_value (m^2)."""
-    from lerobot_latentsafe.dubins.ground_truth import exact_value
-
     while True:
         y = rng.uniform(-0.6, 0.6)
         state = np.array([rng.uniform(-1.0, -0.85), y, np.arctan2(-y, 1.8) + rng.uniform(-0.5, 0.5)])

@@ -14,7 +14,7 @@ from lerobot_latentsafe.franka.scenes import SCENES, check_scene
 @EnvConfig.register_subclass("latentsafe_dubins")
 @dataclass
 class LatentSafeDubinsEnv(EnvConfig):
-    """The paper's Dubins car (see `envs/dubins.py`).
+    """The paper's Dubins car (see `envs/dubins_env.py`).
 
     Attributes:
         variant: continuous, discrete or anywhere.
@@ -65,7 +65,7 @@ class FrankaEnv(EnvConfig):
     """A scene of the simulated Franka, with the features its robot records.
 
     Attributes:
-        variant: of the scene, see `envs/scenes.py`; None takes the default.
+        variant: of the scene, see `franka/scenes.py`; None takes the default.
         episode_length: control steps; None takes the scene's.
         image_size: side of both cameras' images; None takes the scene's.
     """
@@ -118,7 +118,7 @@ class FrankaEnv(EnvConfig):
 @EnvConfig.register_subclass("latentsafe_bag")
 @dataclass
 class LatentSafeBagEnv(FrankaEnv):
-    """Lift an open bag without spilling candy (see `envs/bag.py`)."""
+    """Lift an open bag without spilling candy (see `franka/bag.py`)."""
 
     task: str | None = "Bag-v0"
     fps: int = SCENES["bag"].fps
@@ -127,7 +127,7 @@ class LatentSafeBagEnv(FrankaEnv):
 @EnvConfig.register_subclass("latentsafe_blocks")
 @dataclass
 class LatentSafeBlocksEnv(FrankaEnv):
-    """Pluck a block from between two others (see `envs/blocks.py`)."""
+    """Pluck a block from between two others (see `franka/blocks.py`)."""
 
     task: str | None = "Blocks-v0"
     fps: int = SCENES["blocks"].fps
@@ -138,6 +138,6 @@ def _register(gym_id: str, entry_point: str) -> None:
         gym.register(gym_id, entry_point=entry_point, disable_env_checker=True)
 
 
-_register("lerobot_latentsafe/Dubins-v0", "lerobot_latentsafe.dubins.car:DubinsEnv")
+_register("lerobot_latentsafe/Dubins-v0", "lerobot_latentsafe.envs.dubins_env:DubinsEnv")
 _register("lerobot_latentsafe/Bag-v0", "lerobot_latentsafe.envs.franka_env:BagEnv")
 _register("lerobot_latentsafe/Blocks-v0", "lerobot_latentsafe.envs.franka_env:BlocksEnv")

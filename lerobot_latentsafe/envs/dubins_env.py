@@ -5,24 +5,13 @@ from typing import ClassVar
 import gymnasium as gym
 import numpy as np
 
-from lerobot_latentsafe.dubins.car import (
-    ARENA,
-    FPS,
-    MAX_TURN_RATE,
-    SPEED,
-    TURN_RATES,
-    Renderer,
-    in_view,
-    margin,
-    observe,
-    step,
-)
-from lerobot_latentsafe.dubins.ground_truth import sample_task_start
+from lerobot_latentsafe.dubins import car
+from lerobot_latentsafe.dubins.ground_truth import exact_value, sample_task_start
 
 
 def snap_to_three_actions(turn_rate: float) -> float:
     """The nearest of the paper's three turn rates."""
-    return float(TURN_RATES[np.abs(TURN_RATES - turn_rate).argmin()])
+    return float(car.TURN_RATES[np.abs(car.TURN_RATES - turn_rate).argmin()])
 
 
 class DubinsEnv(gym.Env):
@@ -35,7 +24,7 @@ class DubinsEnv(gym.Env):
     allowed (the disc is a no-go zone, not a wall), leaving the view ends the episode.
     """
 
-    metadata: ClassVar[dict] = {"render_modes": ["rgb_array"], "render_fps": FPS}
+    metadata: ClassVar[dict] = {"render_modes": ["rgb_array"], "render_fps": car.FPS}
     variants = ("continuous", "discrete", "anywhere")
 
     def __init__(self, variant: str = "continuous", episode_length: int = 80, image_size: int = 128,
@@ -46,8 +35,8 @@ class DubinsEnv(gym.Env):
         self._max_episode_steps = episode_length
         self.task_description = "drive to the right edge without entering the red disc"
         self.task = self.task_description
-        self.renderer = Renderer(image_size)
-        low, high = np.array([-MAX_TURN_RATE, SPEED]), np.array([MAX_TURN_RATE, SPEED])
+        self.renderer = car.Renderer(image_size)
+        low, high = np.array([-car.MAX_TURN_RATE, car.SPEED]), np.array([car.MAX_TURN_RATE, car.SPEED])
         self.action_space = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32))
         self.observation_space = gym.spaces.Dict(
             {
@@ -68,22 +57,22 @@ class DubinsEnv(gym.Env):
             self.state = self._sample_anywhere()
         else:
             self.state = sample_task_start(self.np_random)
-        self.steps, self.failed = 0, bool(margin(self.state) < 0)
+        self.steps, self.failed = 0, bool(car.margin(self.state) < 0)
         return self._observation(), self._info(success=False)
 
     def step(self, action: np.ndarray):
         action = np.asarray(action, float).reshape(-1)
         if action.shape != (2,) or not np.isfinite(action).all():
             raise ValueError(f"action is {action}; expected a finite turn rate in rad/s and the speed in m/s")
-        turn_rate = float(np.clip(action[0], -MAX_TURN_RATE, MAX_TURN_RATE))
+        turn_rate = float(np.clip(action[0], -car.MAX_TURN_RATE, car.MAX_TURN_RATE))
         if self.variant == "discrete":
             turn_rate = snap_to_three_actions(turn_rate)
-        self.state = step(self.state, turn_rate)
+        self.state = car.step(self.state, turn_rate)
         self.steps += 1
-        self.failed |= bool(margin(self.state) < 0)
-        arrived = bool(self.state[0] >= 0.9 and in_view(self.state))
+        self.failed |= bool(car.margin(self.state) < 0)
+        arrived = bool(self.state[0] >= 0.9 and car.in_view(self.state))
         success = arrived and not self.failed
-        terminated = arrived or not in_view(self.state)
+        terminated = arrived or not car.in_view(self.state)
         truncated = self.steps >= self._max_episode_steps and not terminated
         return self._observation(), float(success), bool(terminated), truncated, self._info(success)
 
@@ -91,15 +80,13 @@ class DubinsEnv(gym.Env):
         return self.renderer(self.state[None])[0]
 
     def _sample_anywhere(self) -> np.ndarray:
-        from lerobot_latentsafe.dubins.ground_truth import exact_value
-
         while True:
-            state = self.np_random.uniform([-ARENA, -ARENA, -np.pi], [0.6, ARENA, np.pi])
+            state = self.np_random.uniform([-car.ARENA, -car.ARENA, -np.pi], [0.6, car.ARENA, np.pi])
             if exact_value(state[None])[0] > 0.02:
                 return state
 
     def _observation(self) -> dict[str, np.ndarray]:
-        seen = observe(self.state[None], self.renderer)
+        seen = car.observe(self.state[None], self.renderer)
         return {
             "pixels": seen["image"][0],
             "agent_pos": seen["heading"][0],
@@ -111,6 +98,6 @@ class DubinsEnv(gym.Env):
         return {
             "is_success": success,
             "failure": self.failed,
-            "margin": float(margin(self.state)),
+            "margin": float(car.margin(self.state)),
             "state": self.state.astype(np.float32),
         }

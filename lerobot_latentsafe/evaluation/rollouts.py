@@ -1,18 +1,144 @@
-"""Bare against shielded: the same policy from the same starts, with and without the filter."""
+"""The one loop over episodes, and what it is there for: a policy bare and shielded, from the same starts.
 
+A world holds episodes side by side, an actor chooses their actions, and `steps` drives them on. Whoever measures
+something accumulates it from the steps: rates here, tables of a study in `experiments`, datasets in `collection`.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, fields
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
 from lerobot.envs import make_env, preprocess_observation
 from lerobot.envs.configs import EnvConfig
+from lerobot.envs.utils import env_to_policy_features
+from lerobot.utils.constants import OBS_IMAGE, OBS_STATE
 
 from lerobot_latentsafe.base_policy import BasePolicy
 from lerobot_latentsafe.decision import FilterDecision, Reason
-from lerobot_latentsafe.evaluation.nearest_frames import Album
+from lerobot_latentsafe.evaluation.nearest_frames import NearestFrames
 from lerobot_latentsafe.evaluation.statistics import paired_p_value, wilson
 from lerobot_latentsafe.latent import Latent, select
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+
+# -- the loop ---
+
+
+class Choice(NamedTuple):
+    """What an actor wants done next."""
+
+    action: Any
+    """In robot units, as the world takes it: (B, A) of most."""
+    decision: FilterDecision | None = None
+    """The filter's, if there is one."""
+
+
+class World(Protocol):
+    """Episodes that have begun, side by side.
+
+    Attributes:
+        info: what is known of where they are now, beyond what an actor sees; of what kind, each world says.
+        over: bool (B,), which of them have ended.
+    """
+
+    info: Any
+    over: np.ndarray
+
+    def observe(self) -> Any:
+        """What an actor sees now: of most worlds a LeRobot batch."""
+
+    def step(self, action: Any) -> None:
+        """Go on to the next state; episodes that have ended may go anywhere."""
+
+
+Actor = Callable[[Any], Choice]
+"""Chooses what to do about what it sees, for the length of the episodes of one world."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of the episodes of a world.
+
+    Attributes:
+        seen: what the actor saw.
+        action: what was executed.
+        decision: the filter's, if there is one.
+        before, info: what was known of the state that was left, and of the one that was reached.
+        alive: bool (B,), episodes that had not ended before.
+    """
+
+    seen: Any
+    action: Any
+    decision: FilterDecision | None
+    before: Any
+    info: Any
+    alive: np.ndarray
+
+
+def steps(world: World, actor: Actor) -> Iterator[Step]:
+    """Drive the episodes of a world on until all have ended."""
+    while not world.over.all():
+        seen, before, alive = world.observe(), world.info, ~world.over
+        choice = actor(seen)
+        world.step(choice.action)
+        yield Step(seen, choice.action, choice.decision, before, world.info, alive)
+
+
+class PolicyActor:
+    """A bare policy, or a filter with or without a base policy, from the beginning of episodes on."""
+
+    def __init__(self, policy: BasePolicy | LatentSafePolicy):
+        policy.reset()
+        self.policy = policy
+
+    @torch.no_grad()
+    def __call__(self, batch: dict[str, Any]) -> Choice:
+        if not isinstance(self.policy, LatentSafePolicy):
+            return Choice(self.policy.propose(batch).cpu().numpy())
+        device = self.policy.model.device
+        decision = self.policy.decide({k: v.to(device) if isinstance(v, torch.Tensor) else v for k, v in batch.items()})
+        return Choice(decision.action.cpu().numpy(), decision)
+
+
+class VectorWorld:
+    """LeRobot's environments, one for each seed; `info` is a dict for each of them."""
+
+    def __init__(self, env: EnvConfig, seeds: Sequence[int]):
+        self.envs = next(iter(make_env(env, n_envs=len(seeds)).values()))[0]
+        self.task = list(self.envs.call("task_description"))
+        self.over = np.zeros(len(seeds), bool)
+        self._observation, info = self.envs.reset(seed=list(seeds))
+        self.info = [_row(info, i) for i in range(len(seeds))]
+
+    def observe(self) -> dict[str, Any]:
+        """A LeRobot batch."""
+        return {**preprocess_observation(self._observation), "task": self.task}
+
+    def step(self, action: np.ndarray) -> None:
+        """Act (B, A) in robot units."""
+        self._observation, _, terminated, truncated, info = self.envs.step(action)
+        ended = terminated | truncated
+        final = info.get("final_info", info)  # an environment whose episode has ended begins another at once
+        self.info = [_row(final if ended[i] else info, i) for i in range(len(ended))]
+        self.over = self.over | ended
+
+    def render(self, n: int) -> list[np.ndarray]:
+        """RGB pictures of the first n."""
+        return self.envs.call("render")[:n] if n else []
+
+    def close(self) -> None:
+        """Free what the environments hold."""
+        self.envs.close()
+
+
+def _row(info: dict[str, Any], i: int) -> dict[str, Any]:
+    """What a vector environment's info says of one environment."""
+    return {name: values[i] for name, values in info.items() if name[0] != "_" and isinstance(values, np.ndarray)}
+
+
+# -- bare against shielded ---
 
 
 @dataclass
@@ -70,88 +196,74 @@ def check_environment(policy: LatentSafePolicy, env: EnvConfig) -> None:
     Raises:
         ValueError: naming what differs.
     """
-    from lerobot.envs.utils import env_to_policy_features
-
-    config, features = policy.config, env_to_policy_features(env)
-    if env.fps != config.fps:
-        raise ValueError(f"--env.fps is {env.fps}, the filter was trained at {config.fps} fps")
-    if tuple(features["action"].shape) != (len(config.action_low),):
+    trained_on, features = policy.config.trained_on, env_to_policy_features(env)
+    if env.fps != trained_on.fps:
+        raise ValueError(f"--env.fps is {env.fps}, the filter was trained at {trained_on.fps} fps")
+    if tuple(features["action"].shape) != (len(trained_on.action_low),):
         raise ValueError(
             f"environment {env.type} takes actions of shape {tuple(features['action'].shape)}, the filter "
-            f"{len(config.action_low)}: {', '.join(config.action_names)}"
+            f"{len(trained_on.action_low)}: {', '.join(trained_on.action_names)}"
         )
-    missing = [key for key in (*config.cameras, "observation.state") if key not in features]
+    missing = [key for key in (*trained_on.cameras, "observation.state") if key not in features]
     if missing:
         raise ValueError(f"environment {env.type} lacks {', '.join(missing)}; it offers {', '.join(features)}")
 
 
 def run_episodes(
-    actor: BasePolicy | LatentSafePolicy, env: EnvConfig, n_episodes: int, seed: int,
-    batch_size: int = 50, n_videos: int = 0, album: Album | None = None,
+    policy: BasePolicy | LatentSafePolicy, env: EnvConfig, n_episodes: int, seed: int,
+    batch_size: int = 50, n_videos: int = 0, seen: NearestFrames | None = None,
 ) -> Episodes:  # fmt: skip
     """Run episodes with seeds seed, seed + 1, ...; equal seeds give equal starts.
 
     Args:
-        actor: a bare policy, or a filter with or without a base policy.
+        policy: a bare policy, or a filter with or without a base policy.
         batch_size: environments stepped together.
         n_videos: of the first so many episodes, keep frames.
-        album: put these frames in, too.
+        seen: add these frames to it, too.
     """
     parts = []
     for first in range(0, n_episodes, batch_size):
         n = min(batch_size, n_episodes - first)
         torch.manual_seed(seed + first)  # a diffusion policy samples
-        parts.append(_run_batch(actor, env, [seed + first + i for i in range(n)], max(0, n_videos - first), album))
+        with closing(VectorWorld(env, range(seed + first, seed + first + n))) as world:
+            parts.append(_run_together(policy, world, max(0, n_videos - first), seen))
     return Episodes.joined(parts)
 
 
-@torch.no_grad()
-def _run_batch(
-    actor: BasePolicy | LatentSafePolicy, env: EnvConfig, seeds: list[int], n_videos: int, album: Album | None
+def _run_together(
+    policy: BasePolicy | LatentSafePolicy, world: VectorWorld, n_videos: int, seen: NearestFrames | None
 ) -> Episodes:
-    vector_env = next(iter(make_env(env, n_envs=len(seeds)).values()))[0]
-    task = vector_env.call("task_description")
-    actor.reset()
-    observation, info = vector_env.reset(seed=seeds)
-    render = lambda: vector_env.call("render")[:n_videos] if n_videos else []  # noqa: E731
-    runs, done = _begun(info, render()), np.zeros(len(seeds), bool)
-    while not done.all():
-        batch = {**preprocess_observation(observation), "task": list(task)}
-        alive, filmed = ~done, np.flatnonzero(~done[:n_videos])
-        if album is not None and len(filmed):
-            seen = {key: batch[key][filmed] for key in album.policy.world_model.image_keys}
-            album.add([runs.frames[i][-1] for i in filmed], seen, batch["observation.state"][filmed])
-        action, decision = _act(actor, batch)
+    runs = _begun(world.info, world.render(n_videos))
+    for step in steps(world, PolicyActor(policy)):
+        alive, filmed = step.alive, np.flatnonzero(step.alive[:n_videos])
+        if seen is not None and len(filmed):
+            images = {key: values[filmed] for key, values in step.seen.items() if key.startswith(OBS_IMAGE)}
+            seen.add([runs.frames[i][-1] for i in filmed], images, step.seen[OBS_STATE][filmed])
         runs.steps[alive] += 1
-        if decision is not None:
-            _note_decision(runs, decision, alive)
+        if step.decision is not None:
+            _note_decision(runs, step.decision, alive)
             for i in filmed:
-                runs.latents[i].append(select(actor.shield.latent, slice(i, i + 1)))
-        observation, _, terminated, truncated, info = vector_env.step(action)
-        over = terminated | truncated
-        final = info.get("final_info", info)
+                runs.latents[i].append(select(policy.shield.latent, slice(i, i + 1)))
         for i in np.flatnonzero(alive):
-            _note_outcome(runs, i, final if over[i] else info)
-        _record(runs.traces, alive, action=torch.from_numpy(action))
-        pictures = render()
-        for i in filmed[~over[filmed]]:
+            _note_outcome(runs, i, step.info[i])
+        _record(runs.traces, alive, action=step.action)
+        pictures = world.render(n_videos)
+        for i in filmed[~world.over[filmed]]:
             runs.frames[i].append(pictures[i])
-        done |= over
-    vector_env.close()
     runs.success &= ~runs.violation
     return runs
 
 
-def _begun(info: dict, pictures: list[np.ndarray]) -> Episodes:
+def _begun(infos: list[dict[str, Any]], pictures: list[np.ndarray]) -> Episodes:
     """Episodes of which the first frame has been seen."""
-    violation = np.array(info["failure"], bool)
-    n = len(violation)
+    n = len(infos)
     runs = Episodes(
-        success=np.zeros(n, bool), violation=violation, steps=np.zeros(n, int), overridden=np.zeros(n, int),
+        success=np.zeros(n, bool), violation=np.zeros(n, bool), steps=np.zeros(n, int), overridden=np.zeros(n, int),
         action_change=np.zeros(n), severity=np.full(n, np.nan),
         traces=[{} for _ in range(n)], frames=[[p] for p in pictures], latents=[[] for _ in pictures],
     )  # fmt: skip
-    _record(runs.traces, np.ones(n, bool), state=np.asarray(info["state"]) if "state" in info else None)
+    for i, info in enumerate(infos):
+        _note_state(runs, i, info)
     return runs
 
 
@@ -165,37 +277,33 @@ def _note_decision(runs: Episodes, decision: FilterDecision, alive: np.ndarray) 
     runs.action_change[alive] += moved[alive]
 
 
-def _note_outcome(runs: Episodes, i: int, info: dict) -> None:
-    """What the environment said of episode i after a step."""
-    runs.violation[i] |= bool(info["failure"][i])
-    runs.success[i] = bool(info["is_success"][i])
-    if "spill_fraction" in info:
-        runs.severity[i] = np.fmax(runs.severity[i], info["spill_fraction"][i])
+def _note_state(runs: Episodes, i: int, info: dict[str, Any]) -> None:
+    """What the environment said of a state of episode i."""
+    runs.violation[i] |= bool(info["failure"])
     if "state" in info:
-        runs.traces[i].setdefault("state", []).append(np.asarray(info["state"][i]).tolist())
+        runs.traces[i].setdefault("state", []).append(np.asarray(info["state"]).tolist())
 
 
-def _act(actor: BasePolicy | LatentSafePolicy, batch: dict) -> tuple[np.ndarray, FilterDecision | None]:
-    if isinstance(actor, BasePolicy):
-        return actor.propose(batch).cpu().numpy(), None
-    batch = {k: v.to(actor.device) if isinstance(v, torch.Tensor) else v for k, v in batch.items()}
-    decision = actor.decide(batch)
-    return decision.action.cpu().numpy(), decision
+def _note_outcome(runs: Episodes, i: int, info: dict[str, Any]) -> None:
+    """What the environment said of episode i after a step."""
+    _note_state(runs, i, info)
+    runs.success[i] = bool(info["is_success"])
+    if "spill_fraction" in info:
+        runs.severity[i] = np.fmax(runs.severity[i], info["spill_fraction"])
 
 
-def _record(traces: list[dict[str, list]], alive: np.ndarray, **columns) -> None:
+def _record(traces: list[dict[str, list]], alive: np.ndarray, **columns: np.ndarray | torch.Tensor) -> None:
     for name, values in columns.items():
-        if values is None:
-            continue
         values = values.tolist()
         for i in np.flatnonzero(alive):
             traces[i].setdefault(name, []).append(values[i])
 
 
 def compare(
-    policy: LatentSafePolicy, env: EnvConfig, n_episodes: int, seed: int, n_videos: int = 0, album: Album | None = None
-) -> dict:
-    """Bare and shielded from the same starts; the frames of the first n_videos episodes are kept, and go to the album.
+    policy: LatentSafePolicy, env: EnvConfig, n_episodes: int, seed: int, n_videos: int = 0,
+    seen: NearestFrames | None = None,
+) -> dict:  # fmt: skip
+    """Bare and shielded from the same starts; the frames of the first n_videos episodes are kept, and added to `seen`.
 
     Returns:
         bare, shielded: rates; violation_p_value: exact McNemar test on the pairs; episodes: both `Episodes`.
@@ -203,8 +311,8 @@ def compare(
     check_environment(policy, env)
     if policy.base is None:
         raise ValueError("nothing to shield: give --base_policy_path, or a checkpoint written by latentsafe wrap")
-    bare = run_episodes(policy.base, env, n_episodes, seed, n_videos=n_videos, album=album)
-    shielded = run_episodes(policy, env, n_episodes, seed, n_videos=n_videos, album=album)
+    bare = run_episodes(policy.base, env, n_episodes, seed, n_videos=n_videos, seen=seen)
+    shielded = run_episodes(policy, env, n_episodes, seed, n_videos=n_videos, seen=seen)
     return {
         "bare": bare.rates(),
         "shielded": shielded.rates(),
@@ -214,7 +322,7 @@ def compare(
     }
 
 
-def count_reasons(reasons: "np.ndarray | list[int]") -> dict[str, int]:
+def count_reasons(reasons: np.ndarray | list[int]) -> dict[str, int]:
     """How many decisions were made for each reason that occurs."""
     counts = np.bincount(reasons, minlength=len(Reason))
     return {reason.name.lower(): int(counts[reason]) for reason in Reason if counts[reason]}
