@@ -108,20 +108,15 @@ def make_model_card(
     config: LatentSafeConfig, dataset_repo_id: str, license: str | None, tags: list[str] | None
 ) -> ModelCard:
     """The card of a filter, from its configuration alone."""
-    trained_on, law = config.trained_on, config.law
-    actions = ", ".join(f"{name} in [{low:g}, {high:g}]" for name, (low, high) in trained_on.ranges.items())
+    law = config.law
     return ModelCard(
         TEXT.format(
             header=_header(dataset_repo_id, license, tags, "latentsafe", "safety-filter"),
             dataset=dataset_repo_id,
-            robot=f"`{trained_on.robot_type}`" if trained_on.robot_type else "unknown",
-            cameras=", ".join(f"`{c}` {tuple(config.input_features[c].shape)}" for c in trained_on.cameras or []),
-            fps=trained_on.fps,
-            actions=actions,
-            states=", ".join(trained_on.state_names or []),
+            **_robot(config),
             world_model=_world_model(config),
             failure=config.margin.failure_specification,
-            stage=trained_on.stage,
+            stage=config.trained_on.stage,
             law=f"{law.name}, V read after {law.proposal_steps} + {law.lookahead} imagined steps",
             epsilon=threshold(law),
             fallback=fallback(law),
@@ -133,6 +128,18 @@ def make_model_card(
             evaluation=_evaluation(config.evaluation),
         )
     )
+
+
+def _robot(config: LatentSafeConfig) -> dict[str, str]:
+    """What the filter sees and does, in words."""
+    trained_on = config.trained_on
+    return {
+        "robot": f"`{trained_on.robot_type}`" if trained_on.robot_type else "unknown",
+        "cameras": ", ".join(f"`{c}` {tuple(config.input_features[c].shape)}" for c in trained_on.cameras or []),
+        "fps": str(trained_on.fps),
+        "actions": ", ".join(f"{name} in [{low:g}, {high:g}]" for name, (low, high) in trained_on.ranges.items()),
+        "states": ", ".join(trained_on.state_names or []),
+    }
 
 
 def threshold(law: LawConfig) -> str:
@@ -147,10 +154,8 @@ def fallback(law: LawConfig) -> str:
     if not law.retreat:
         return "the critic's action"
     moves = ", ".join(f"{name} {motion:+g} a step" for name, motion in law.retreat.items())
-    after = (
-        f"the critic's action; after {law.retreat_after} overrides within {RECENT} steps " if law.retreat_after else ""
-    )
-    return f"{after}the retreat ({moves}) for at least {law.min_retreat_steps} steps"
+    tried = f"the critic's action; after {law.retreat_after} overrides within {RECENT} steps "
+    return f"{tried if law.retreat_after else ''}the retreat ({moves}) for at least {law.min_retreat_steps} steps"
 
 
 def _world_model(config: LatentSafeConfig) -> str:
@@ -158,7 +163,8 @@ def _world_model(config: LatentSafeConfig) -> str:
     if perception := getattr(config.world_model, "perception", None):
         text += f", on {perception.components} components of the frozen encoder `{perception.encoder}`"
         text += f" (weights {perception.encoder_hash}), which is not part of the checkpoint"
-    return text + (f"; remembers {frames} frames at most" if (frames := config.law.history_frames) else "")
+    frames = config.law.history_frames
+    return text + (f"; remembers {frames} frames at most" if frames else "")
 
 
 def _imagination(samples: int) -> str:

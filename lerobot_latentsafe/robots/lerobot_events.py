@@ -1,4 +1,4 @@
-"""What LeRobot's loops say aloud: they have no call that begins an episode, they *say* so, to a person."""
+"""Events of LeRobot's loops, heard in what they log: no call tells a robot that an episode begins."""
 
 import logging
 
@@ -6,19 +6,22 @@ from lerobot_latentsafe._compat import RECORDING, RESETTING, RETURNING
 
 
 class LeRobotEvents(logging.Handler):
-    """Hears LeRobot announce an episode, or what comes between episodes and after them, while it is `listening`."""
+    """Hears in LeRobot's log when an episode begins or ends, between `listen` and `stop`."""
 
     def __init__(self):
         super().__init__(logging.INFO)
         self._heard: int | str | None = None
 
     def listen(self) -> None:
+        """Begin to hear what LeRobot logs."""
         logging.getLogger().addHandler(self)
 
     def stop(self) -> None:
+        """Hear nothing any more."""
         logging.getLogger().removeHandler(self)
 
     def emit(self, record: logging.LogRecord) -> None:
+        """Note what a line of the log announces, if anything."""
         said = str(record.msg)
         if recording := RECORDING.match(said):
             self._heard = int(recording[1])
@@ -26,6 +29,6 @@ class LeRobotEvents(logging.Handler):
             self._heard = RESETTING if said.startswith(RESETTING) else RETURNING
 
     def take(self) -> int | str | None:
-        """The last announcement since the last call: an episode's number, `RESETTING` or `RETURNING`."""
+        """The last event since the last call: the number of an episode that begins, `RESETTING` or `RETURNING`."""
         heard, self._heard = self._heard, None
         return heard

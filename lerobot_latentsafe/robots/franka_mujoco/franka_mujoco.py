@@ -9,7 +9,7 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 from lerobot_latentsafe.franka.actions import ACTION_NAMES, GRIPPER_NAME, JOINT_NAMES, STATE_NAMES, read_action
 from lerobot_latentsafe.franka.scenes import SCENES, make_scene
 from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
-from lerobot_latentsafe.robots.lerobot_events import Announcements
+from lerobot_latentsafe.robots.lerobot_events import LeRobotEvents
 
 CAMERAS = ("front", "wrist")
 
@@ -35,7 +35,7 @@ class LatentSafeFrankaMujoco(Robot):
         self.cameras = dict.fromkeys(CAMERAS)
         self.scene = None
         self.episode = 0
-        self._announcements = Announcements()
+        self._events = LeRobotEvents()
 
     @cached_property
     def observation_features(self) -> dict:
@@ -68,7 +68,7 @@ class LatentSafeFrankaMujoco(Robot):
         scene.render(CAMERAS[0])  # fails here, not in the middle of an episode, where nothing can draw
         self.scene = scene
         self.episode += 1
-        self._announcements.listen()
+        self._events.listen()
         _connected.append(self)
 
     def reset(self, seed: int) -> None:
@@ -79,7 +79,7 @@ class LatentSafeFrankaMujoco(Robot):
 
     def get_observation(self) -> dict:
         self._require_connection()
-        announced = self._announcements.take()
+        announced = self._events.take()
         if isinstance(announced, int):
             self.reset(self.config.seed + announced)
         state = dict(zip(STATE_NAMES, self.scene.proprioception().tolist()))
@@ -109,7 +109,7 @@ class LatentSafeFrankaMujoco(Robot):
 
     def disconnect(self) -> None:
         self._require_connection()
-        self._announcements.stop()
+        self._events.stop()
         _connected.remove(self)
         self.scene.close()
         self.scene = None

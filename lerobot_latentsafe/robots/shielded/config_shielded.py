@@ -1,10 +1,12 @@
 """Options of a shielded robot."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import draccus
 from lerobot.robots.config import RobotConfig
+
+from lerobot_latentsafe.decision import LawOptions
 
 NAME = "latentsafe_shielded"
 
@@ -15,14 +17,17 @@ class InnerRobotConfig(draccus.ChoiceRegistry):
 
     @classmethod
     def get_known_choices(cls) -> dict[str, type]:
+        """Name -> options class of each robot that may be shielded."""
         return {name: kind for name, kind in RobotConfig.get_known_choices().items() if name != NAME}
 
     @classmethod
     def get_choice_class(cls, name: str) -> type:
+        """The options class of a robot."""
         return cls.get_known_choices()[name]
 
     @classmethod
     def get_choice_name(cls, subcls: type) -> str:
+        """The name of a robot."""
         return RobotConfig.get_choice_name(subcls)
 
 
@@ -34,8 +39,7 @@ class LatentSafeShieldedConfig(RobotConfig):
     Attributes:
         inner: the robot that moves.
         filter: a trained filter: a folder, a Hub id or the name of a committed one.
-        mode: `filter` or `monitor`, which only reports; None takes the filter's.
-        epsilon, guard, release: of the filter law; None takes the filter's.
+        law: changes of the filter's law, such as `--robot.law.epsilon=0.3` or `--robot.law.mode=monitor`.
         device: where the filter runs; None takes the filter's.
         fps: rate of the loop that drives it, if known beforehand: it must be the filter's.
         unfiltered_moves: let pass what moves the robot between episodes (LeRobot's return of an arm to its start, a
@@ -46,10 +50,7 @@ class LatentSafeShieldedConfig(RobotConfig):
 
     inner: InnerRobotConfig | None = None
     filter: str | None = None
-    mode: str | None = None
-    epsilon: float | None = None
-    guard: int | None = None
-    release: float | None = None
+    law: LawOptions = field(default_factory=LawOptions)
     device: str | None = None
     fps: int | None = None
     unfiltered_moves: bool = False

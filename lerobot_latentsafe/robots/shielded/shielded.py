@@ -15,12 +15,14 @@ from lerobot.robots.utils import make_robot_from_config
 from lerobot.utils.constants import OBS_IMAGES, OBS_STATE, OBS_STR
 from lerobot.utils.feature_utils import build_dataset_frame
 
-from lerobot_latentsafe.configuration_latentsafe import DECIDES
+from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
 from lerobot_latentsafe.datasets.decisions import Journal
-from lerobot_latentsafe.datasets.frame_cache import check_proportions
 from lerobot_latentsafe.decision import FilterDecision, Reason
-from lerobot_latentsafe.robots.lerobot_events import Announcements
+from lerobot_latentsafe.encoders.pictures import check_proportions
+from lerobot_latentsafe.modeling_latentsafe import load_filter
+from lerobot_latentsafe.robots.lerobot_events import LeRobotEvents
 from lerobot_latentsafe.robots.shielded.config_shielded import LatentSafeShieldedConfig
+from lerobot_latentsafe.units import TrainedOn
 
 logger = logging.getLogger(__name__)
 
@@ -37,62 +39,40 @@ class LatentSafeShielded(Robot):
 
     Observations also hold `shield.value`, `shield.margin` (not a number before the first decision) and
     `shield.intervened` of the last decision: recordings leave them out, `--display_data=true` shows them.
+
+    Attributes:
+        inner: the robot that moves.
+        filter: the filter, with the robot's own law.
+        journal: the decisions of a recording, if there is one.
     """
 
     config_class = LatentSafeShieldedConfig
     name = "latentsafe_shielded"
 
     def __init__(self, config: LatentSafeShieldedConfig):
-        from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
-
         super().__init__(config)
         self.config = config
         self.inner = make_robot_from_config(config.inner)
         self.name = self.robot_type = self.inner.name
-        self.filter = LatentSafePolicy.from_pretrained(config.filter).eval()
-        self.filter.config.override(config, "mode", *DECIDES)
-        if config.device:
-            self.filter.to(config.device)
-        self.filter.require_stage(self.filter.needed_stage)
+        self.filter = load_filter(config.filter, law=config.law, device=config.device)
+        self.filter.model.require_trained_for_law()
+        self._trained_on = self.filter.config.trained_on
         self._check_fit()
         self.journal = Journal(config.journal) if config.journal else None
-        self._announcements = Announcements()
+        self._events = LeRobotEvents()
         self._sent: dict[str, float] = {}
         self._early = False
         self._forget()
 
     def _check_fit(self) -> None:
-        """Refuse a filter of another robot before anything moves."""
-        robot, config = self.inner, self.filter.config
-        scalars = [name for name, kind in robot.observation_features.items() if not isinstance(kind, tuple)]
-        cameras = [name for name, kind in robot.observation_features.items() if isinstance(kind, tuple)]
-        wanted = [key.removeprefix(f"{OBS_IMAGES}.") for key in self.filter.world_model.image_keys]
-        missing = [name for name in wanted if name not in cameras]
-        if missing:
+        """Refuse a filter of another robot, or of another rate, before anything moves."""
+        filter, fps = self.config.filter, self._trained_on.fps
+        _check_cameras(self.inner, filter, self.filter.config)
+        _check_names(self.inner, filter, self._trained_on)
+        if self.config.fps not in (None, fps):
             raise ValueError(
-                f"{robot.name} has no camera {', '.join(missing)}; the filter {self.config.filter} sees "
-                f"{', '.join(wanted)}, the robot has {', '.join(cameras) or 'none'}. Name its cameras alike, or "
-                "train a filter for this robot"
-            )
-        for name in wanted:
-            key, (height, width, channels) = f"{OBS_IMAGES}.{name}", robot.observation_features[name]
-            check_proportions(key, (channels, height, width), config.input_features[key].shape)
-        acts_in, offered = set(config.action_names), set(robot.action_features)
-        if acts_in != offered:
-            raise ValueError(
-                f"the filter {self.config.filter} acts in {', '.join(config.action_names)}; {robot.name} in "
-                f"{', '.join(robot.action_features)}. Train a filter on data of this robot"
-            )
-        unread = [name for name in config.state_names if name not in scalars]
-        if unread:
-            raise ValueError(
-                f"{robot.name} does not observe {', '.join(unread)}, which the filter {self.config.filter} reads; it "
-                f"observes {', '.join(scalars) or 'nothing'}. Train a filter on data of this robot"
-            )
-        if self.config.fps not in (None, config.fps):
-            raise ValueError(
-                f"the loop is to run at {self.config.fps} Hz, but the filter {self.config.filter} decides "
-                f"{config.fps} times a second: give --fps={config.fps} (--dataset.fps={config.fps} to record)"
+                f"the loop is to run at {self.config.fps} Hz, but the filter {filter} decides {fps} times a second: "
+                f"give --fps={fps} (--dataset.fps={fps} to record)"
             )
 
     # -- the inner robot ---
@@ -104,36 +84,44 @@ class LatentSafeShielded(Robot):
 
     @property
     def observation_features(self) -> dict:
+        """Those of the inner robot."""
         return self.inner.observation_features
 
     @property
     def action_features(self) -> dict:
+        """Those of the inner robot."""
         return self.inner.action_features
 
     @property
     def is_connected(self) -> bool:
+        """Whether the inner robot is."""
         return "inner" in self.__dict__ and self.inner.is_connected
 
     @property
     def is_calibrated(self) -> bool:
+        """Whether the inner robot is."""
         return self.inner.is_calibrated
 
     def calibrate(self) -> None:
+        """Calibrate the inner robot."""
         self.inner.calibrate()
 
     def configure(self) -> None:
+        """Configure the inner robot."""
         self.inner.configure()
 
     def connect(self, calibrate: bool = True) -> None:
+        """Connect the inner robot, and listen to LeRobot's events."""
         self.inner.connect(calibrate)
-        self._announcements.listen()
+        self._events.listen()
         self._forget()
         _connected.append(self)
 
     def disconnect(self) -> None:
+        """Write the journal, and disconnect the inner robot."""
         if self in _connected:
             _connected.remove(self)
-        self._announcements.stop()
+        self._events.stop()
         try:
             if self.journal:
                 self.journal.write()
@@ -144,7 +132,7 @@ class LatentSafeShielded(Robot):
 
     def get_observation(self) -> dict:
         """The inner robot's observation, and what was decided last."""
-        announced = self._announcements.take()
+        announced = self._events.take()
         if announced is not None:
             self._forget()
             self._phase = announced
@@ -174,15 +162,14 @@ class LatentSafeShielded(Robot):
         early, self._sent_early = self._sent_early, None
         if early is not None and action == early:
             return early
-        shield, names = self.filter.shield, self.filter.config.action_names
+        shield, names = self.filter.shield, self._trained_on.action_names
         before = shield.decision
         sent = self.inner.send_action(self._decide(action))
         self._sent.update(sent)
         if self.journal and shield.decision is not None and shield.decision is not before:
             self.journal.add(shield.decision, [float(sent[name]) for name in names])
         if set(sent) == set(names) and shield.executed is not None:  # the robot may have clipped it
-            executed = torch.tensor([[float(sent[name]) for name in names]], device=self.filter.device)
-            shield.executed = self.filter.normalise_action(executed).nan_to_num(0.0).clamp(-1, 1)
+            shield.was_executed(torch.tensor([[float(sent[name]) for name in names]], device=self.filter.model.device))
         return sent
 
     def send_early(self, action: dict[str, float]) -> dict[str, float]:
@@ -203,7 +190,7 @@ class LatentSafeShielded(Robot):
 
     def _decide(self, action: dict[str, float]) -> dict[str, float]:
         """What is to be executed instead of an action, or that action itself."""
-        names, shield, period = self.filter.config.action_names, self.filter.shield, 1.0 / self.filter.config.fps
+        names, shield, period = self._trained_on.action_names, self.filter.shield, 1.0 / self._trained_on.fps
         known = set(action) == set(names)
         if self.config.unfiltered_moves and (self._between or not known) and all(map(math.isfinite, action.values())):
             self._say_once("moves between episodes, or of other names, are not filtered (--robot.unfiltered_moves)")
@@ -220,8 +207,8 @@ class LatentSafeShielded(Robot):
         if rate == Reason.PASSED and age <= period and shield.adopt(proposed, period):
             self._say_once("these actions come from a policy under this very filter; they are not filtered again")
         else:
-            batch = prepare_observation_for_inference(self._frame(), self.filter.device)
-            shield(batch, proposed, age, known=rate)
+            batch = prepare_observation_for_inference(self._frame(), self.filter.model.device)
+            shield(batch, proposed, age, fault=rate)
         return self._carry_out(shield.decision, action)
 
     @property
@@ -237,10 +224,10 @@ class LatentSafeShielded(Robot):
             self._say_once(
                 "LeRobot stores what was proposed, not what is executed now; `latentsafe record` stores that"
             )
-        return dict(zip(self.filter.config.action_names, decision.action[0].tolist()))
+        return dict(zip(self._trained_on.action_names, decision.action[0].tolist()))
 
     def _hold(self, action: dict[str, float]) -> dict[str, float]:
-        """Instead of a command of which the filter knows nothing: no motion, the kept commands as they are."""
+        """Instead of a command of which the filter knows nothing: no motion, the frozen commands as they are."""
         self._say_once(
             f"the filter knows nothing of a command of {', '.join(action)}: "
             "the robot holds still. --robot.unfiltered_moves=true lets such moves pass unfiltered"
@@ -248,15 +235,15 @@ class LatentSafeShielded(Robot):
         self._decided_at = -math.inf
         if self._observation is None:
             self.get_observation()
-        config, now = self.filter.config, {**self._observation, **self._sent}
-        still = dict(zip(config.action_names, self.filter.hold_action(1)[0].tolist()))
-        return {**still, **{name: float(now[name]) for name in config.kept_commands if name in now}}
+        now, frozen = {**self._observation, **self._sent}, self.filter.config.fallback.frozen_commands
+        still = dict(zip(self._trained_on.action_names, self.filter.model.units.hold_action(1)[0].tolist()))
+        return {**still, **{name: float(now[name]) for name in frozen if name in now}}
 
     # -- what the filter is told ---
 
     def _check_rate(self, now: float) -> Reason:
         """Start anew after a pause; a loop that runs at another rate than the filter is no ground to decide on."""
-        fps, gap = self.filter.config.fps, now - self._decided_at if self._decided_at is not None else 0.0
+        fps, gap = self._trained_on.fps, now - self._decided_at if self._decided_at is not None else 0.0
         self._decided_at = now
         if gap > PAUSE_S:
             logger.info("the filter starts anew after a pause")
@@ -277,15 +264,16 @@ class LatentSafeShielded(Robot):
 
     def _frame(self) -> dict[str, np.ndarray]:
         """The last observation as LeRobot's datasets name and type it."""
-        names = self.filter.config.state_names
+        names = self._trained_on.state_names
         state = {"dtype": "float32", "shape": (len(names),), "names": names}
-        pictures = {key: {"dtype": "image"} for key in self.filter.world_model.image_keys}
+        pictures = {key: {"dtype": "image"} for key in self.filter.model.world_model.image_keys}
         return build_dataset_frame({OBS_STATE: state, **pictures}, self._observation, prefix=OBS_STR)
 
     def _watch_cameras(self) -> None:
         """Note since when each picture has been the same although the robot moved: such a camera is frozen."""
         frame, now = self._frame(), self._seen_at
-        state = self.filter.normalise_state(torch.from_numpy(frame.pop(OBS_STATE)).to(self.filter.device))
+        units = self.filter.model.units
+        state = units.normalise_state(torch.from_numpy(frame.pop(OBS_STATE)).to(units.device))
         for key, picture in frame.items():
             last = self._cameras.get(key)
             if last is None or not np.array_equal(last["picture"], picture):
@@ -313,6 +301,37 @@ class LatentSafeShielded(Robot):
         self._gaps: deque[float] = deque(maxlen=RATE_DECISIONS)
         self._cameras: dict[str, dict] = {}
         self._said: set[str] = set()
+
+
+def _check_cameras(robot: Robot, filter: str, config: LatentSafeConfig) -> None:
+    """Refuse a robot without a camera that the filter looks through, or with pictures of other proportions."""
+    cameras = [name for name, kind in robot.observation_features.items() if isinstance(kind, tuple)]
+    wanted = [key.removeprefix(f"{OBS_IMAGES}.") for key in config.trained_on.cameras]
+    missing = [name for name in wanted if name not in cameras]
+    if missing:
+        raise ValueError(
+            f"{robot.name} has no camera {', '.join(missing)}; the filter {filter} sees {', '.join(wanted)}, the robot "
+            f"has {', '.join(cameras) or 'none'}. Name its cameras alike, or train a filter for this robot"
+        )
+    for name in wanted:
+        key, (height, width, channels) = f"{OBS_IMAGES}.{name}", robot.observation_features[name]
+        check_proportions(key, (channels, height, width), config.input_features[key].shape)
+
+
+def _check_names(robot: Robot, filter: str, trained_on: TrainedOn) -> None:
+    """Refuse a robot that takes other commands than the filter gives, or does not observe what the filter reads."""
+    if set(trained_on.action_names) != set(robot.action_features):
+        raise ValueError(
+            f"the filter {filter} acts in {', '.join(trained_on.action_names)}; {robot.name} in "
+            f"{', '.join(robot.action_features)}. Train a filter on data of this robot"
+        )
+    scalars = [name for name, kind in robot.observation_features.items() if not isinstance(kind, tuple)]
+    unread = [name for name in trained_on.state_names if name not in scalars]
+    if unread:
+        raise ValueError(
+            f"{robot.name} does not observe {', '.join(unread)}, which the filter {filter} reads; it observes "
+            f"{', '.join(scalars) or 'nothing'}. Train a filter on data of this robot"
+        )
 
 
 _connected: list[LatentSafeShielded] = []
