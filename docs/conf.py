@@ -30,6 +30,8 @@ napoleon_use_rtype = False
 python_use_unqualified_type_names = True
 
 html_theme = "furo"
-html_title = "lerobot_latentsafe"
+html_title = "latentsafe for LeRobot"
+html_static_path = ["_static"]
+html_css_files = ["options.css"]
 html_show_sourcelink = False
 html_theme_options = {"navigation_with_keys": True}

@@ -1,4 +1,4 @@
-"""README and docs name only what exists: files, verbs, options, make targets, scripts, Python names; none by an old name."""
+"""README and docs name only what exists: files, verbs, options, make targets, scripts, Python names."""
 
 import ast
 import importlib
@@ -11,10 +11,8 @@ from collections.abc import Iterator
 from dataclasses import fields, is_dataclass
 from functools import cache
 from pathlib import Path
-from types import UnionType
 
 import pytest
-from draccus import ChoiceRegistry
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_latentsafe.cli import VERBS
@@ -116,10 +114,10 @@ def has_option(options: type, path: list[str], given: dict[str, str], prefix: st
     head, *rest = path
     if head not in {field.name for field in fields(options)}:
         return False
-    kind, name = plain(typing.get_type_hints(options)[head]), f"{prefix}{head}"
+    kind, name = reference.plain(typing.get_type_hints(options)[head]), f"{prefix}{head}"
     if not rest:
         return True
-    if not (isinstance(kind, type) and issubclass(kind, ChoiceRegistry)):
+    if not reference.is_registry(kind):
         return is_dataclass(kind) and has_option(kind, rest, given, f"{name}.")
     choices = kind.get_known_choices()
     if rest == ["type"]:
@@ -128,13 +126,6 @@ def has_option(options: type, path: list[str], given: dict[str, str], prefix: st
         return head == "policy"
     chosen = [given[f"{name}.type"]] if f"{name}.type" in given else list(choices)
     return any(has_option(kind.get_choice_class(c), rest, given, f"{name}.") for c in chosen if c in choices)
-
-
-def plain(kind: type) -> type:
-    """X of `X | None`."""
-    if typing.get_origin(kind) in (typing.Union, UnionType):
-        return next(k for k in typing.get_args(kind) if k is not type(None))
-    return kind
 
 
 def is_known(option: str) -> bool:
@@ -198,7 +189,8 @@ def wrong_span(span: str) -> Iterator[str]:
     elif re.fullmatch(r"[\w.{},/-]+", span):
         for path in expanded(span):
             file = path.endswith(NAMED_FILES) and path not in INVENTED
-            if (file or path.split("/")[0] in PLACES and "/" in path) and not exists(path):
+            place = "/" in path and path.split("/")[0] in PLACES
+            if (file or place) and not exists(path):
                 yield f"{path} does not exist"
 
 
@@ -211,19 +203,24 @@ def expanded(path: str) -> list[str]:
 
 
 def exists(path: str) -> bool:
-    """A file of the repository, named from its root or from the package; what is made while one works is not looked for."""
-    made = path.startswith(("docs/_build", "outputs/", "data/"))
+    """A file of the repository, named from its root or from the package; what commands make is not looked for."""
+    if path.startswith(("docs/_build", "outputs/", "data/")):
+        return True
     names = (ROOT / path, ROOT / "lerobot_latentsafe" / path)
-    return made or any(p.exists() for p in names) or ("/" not in path and any(ROOT.glob(f"lerobot_latentsafe/*/{path}")))
+    anywhere = () if "/" in path else ROOT.glob(f"lerobot_latentsafe/*/{path}")
+    return any(p.exists() for p in (*names, *anywhere))
 
 
 def python_name(dotted: str) -> bool:
     """Whether a dotted name is a module, or what a module holds."""
-    module, _, name = dotted.rpartition(".")
     try:
         importlib.import_module(dotted)
     except ModuleNotFoundError:
-        return bool(module) and importlib.util.find_spec(module) is not None and name in dir(importlib.import_module(module))
+        module, _, name = dotted.rpartition(".")
+        try:
+            return hasattr(importlib.import_module(module), name)
+        except ModuleNotFoundError:
+            return False
     return True
 
 
@@ -291,7 +288,7 @@ def test_what_does_not_exist_is_found(text, problem):
 
 
 def test_what_exists_is_found():
-    text = """`latentsafe label`, `--law.epsilon=0.3`, `scripts/setup.sh`, `lerobot_latentsafe.shield.Shield`, `margin.py`
+    text = """`latentsafe label`, `--law.epsilon=0.3`, `scripts/setup.sh`, `lerobot_latentsafe.shield.Shield`
 ```bash
 MUJOCO_GL=egl latentsafe report --policy.path=bag --env.type=latentsafe_bag --env.episode_length=150   # a comment
 lerobot-rollout --policy.path=x --policy.law.mode=monitor --robot.type=latentsafe_franka_mujoco --robot.scene=bag
