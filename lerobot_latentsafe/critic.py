@@ -58,7 +58,7 @@ class FallbackConfig:
     @property
     def named_commands(self) -> list[str]:
         """All commands that are spoken of, without directions."""
-        return [*self.frozen_commands, *(name.removeprefix("+").removeprefix("-") for name in self.moves or [])]
+        return [*self.frozen_commands, *(name[1:] if name[:1] in ("+", "-") else name for name in self.moves or [])]
 
     def bounds(self, names: list[str], movable: Tensor) -> tuple[Tensor, Tensor]:
         """Lowest and highest action (A,) in [-1, 1] of a continuous fallback.

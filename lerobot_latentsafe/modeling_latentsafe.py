@@ -251,7 +251,7 @@ def adopt(config: LatentSafeConfig, meta: Any, stats: dict) -> FilterData:
     data.check_cameras({key: config.input_features[key].shape for key in data.cameras if key in config.input_features})
     trained_on = adopt_dataset(config.trained_on, meta, stats)
     trained_on.cameras = list(data.cameras)
-    check_candidates(config.fallback.action_candidates, trained_on)
+    check_candidates(config.fallback.action_candidates, trained_on, meta.repo_id)
     pictures = {key: PolicyFeature(FeatureType.VISUAL, shape) for key, shape in data.cameras.items()}
     world_model = config.world_model
     config.change(

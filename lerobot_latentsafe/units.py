@@ -178,8 +178,8 @@ def _check_range(trained_on: TrainedOn, repo_id: str, low: list[float], high: li
             )
 
 
-def check_candidates(candidates: list[list[float]] | None, trained_on: TrainedOn) -> None:
-    """Refuse a discrete action set (K, A) that leaves the range of the data.
+def check_candidates(candidates: list[list[float]] | None, trained_on: TrainedOn, repo_id: str) -> None:
+    """Refuse a discrete action set (K, A) that leaves the range of a dataset.
 
     Raises:
         ValueError: naming the candidate and the range.
@@ -189,7 +189,7 @@ def check_candidates(candidates: list[list[float]] | None, trained_on: TrainedOn
         inside = all(low - 1e-4 <= a <= high + 1e-4 for low, a, high in bounds)
         if len(candidate) != len(trained_on.action_low) or not inside:
             raise ValueError(
-                f"action candidate {candidate} is outside of what the data cover: "
+                f"action candidate {candidate} is outside of what {repo_id} covers: "
                 f"{trained_on.action_low} to {trained_on.action_high}"
             )
 

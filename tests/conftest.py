@@ -93,7 +93,7 @@ def tiny_continuous_filter(cache_meta, tmp_path_factory):
     from lerobot_latentsafe.training import train_reachability
 
     folder = tmp_path_factory.mktemp("filters")
-    stage_one = tiny.train_stage_one(cache_meta, folder / "stage_one", action_candidates=None)
+    stage_one = tiny.train_stage_one(cache_meta, folder / "stage_one", fallback_action_candidates=None)
     train_reachability(stage_one, cache_meta, folder / "continuous")
     return folder / "continuous"
 

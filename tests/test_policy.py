@@ -13,9 +13,11 @@ from safetensors.torch import load_file, save_file
 
 from lerobot_latentsafe import LatentSafeConfig, LatentSafeDubinsEnv
 from lerobot_latentsafe.base_policy import BasePolicy
+from lerobot_latentsafe.configuration_latentsafe import SEALED
 from lerobot_latentsafe.decision import Reason
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, UntrainedFilterError
-from lerobot_latentsafe.runtime.checkpoint import CheckpointError, resolve_checkpoint, save_filter, seal
+from lerobot_latentsafe.runtime.checkpoint import CheckpointError, resolve_checkpoint, seal
+from lerobot_latentsafe.runtime.hub import save_policy
 from lerobot_latentsafe.training import train_reachability
 from lerobot_latentsafe.units import adopt_dataset
 
@@ -38,22 +40,22 @@ def shielded(policy, tiny_diffusion):
 
 
 def test_loaded_filter_decides_as_the_saved_one(policy, tmp_path):
-    policy.config.epsilon = 0.01
-    save_filter(policy, tmp_path / "again")
+    policy.config.law.epsilon = 0.01
+    save_policy(policy, tmp_path / "again")
     again = load(tmp_path / "again")
-    assert again.config.epsilon == 0.01 and again.config.stage == "reachability"
+    assert again.config.law.epsilon == 0.01 and again.config.trained_on.stage == "critic"
     assert_same_decisions(policy, again)
 
 
 def test_continuous_filter_survives_saving(tiny_continuous_filter, tmp_path):
     policy = load(tiny_continuous_filter)
-    save_filter(policy, tmp_path / "again")
+    save_policy(policy, tmp_path / "again")
     assert_same_decisions(policy, load(tmp_path / "again"))
 
 
 def test_half_weights_are_half_as_large_and_decide_alike(policy, tmp_path):
-    save_filter(policy, tmp_path / "full")
-    save_filter(policy, tmp_path / "half", half=True)
+    save_policy(policy, tmp_path / "full")
+    save_policy(policy, tmp_path / "half", half=True)
     full, half = (tmp_path / name / "model.safetensors" for name in ("full", "half"))
     assert half.stat().st_size < 0.7 * full.stat().st_size
     assert {t.dtype for t in load_file(half).values()} == {torch.float16}
@@ -106,18 +108,18 @@ def test_unreadable_config_of_a_base_policy_is_refused(tmp_path, content):
     if content is not None:
         (tmp_path / "config.json").write_text(content)
     with pytest.raises(CheckpointError, match=r"config\.json"):
-        BasePolicy(tmp_path, "cpu")
+        BasePolicy.load(tmp_path)
 
 
 def test_stage_edited_by_hand_trains_no_critic(tiny_world_model, tmp_path):
     copy = shutil.copytree(tiny_world_model, tmp_path / "copy")
-    tiny.rewrite_json(copy / "config.json", stage="reachability")
+    tiny.rewrite_group(copy, "trained_on", stage="critic")
     with pytest.raises(CheckpointError, match=r"config\.json"):
         load(copy)
 
 
 def test_units_edited_by_hand_are_refused(filter_copy):
-    tiny.rewrite_json(filter_copy / "config.json", action_high=[12.5, 1.0])
+    tiny.rewrite_group(filter_copy, "trained_on", action_high=[12.5, 1.0])
     with pytest.raises(CheckpointError, match=r"config\.json"):
         load(filter_copy)
 
@@ -127,11 +129,11 @@ def test_weights_that_do_not_fit_the_config_are_refused(filter_copy, change):
     weights = filter_copy / "model.safetensors"
     tensors = load_file(weights)
     if change == "missing":
-        tensors = {k: v for k, v in tensors.items() if not k.startswith("critic.q.")}
+        tensors = {k: v for k, v in tensors.items() if not k.startswith("model.critic.q.")}
     else:
-        tensors["critic.q.99.weight"] = torch.zeros(2)
+        tensors["model.critic.q.99.weight"] = torch.zeros(2)
     save_file(tensors, weights, metadata={"format": "pt"})
-    seal(filter_copy)
+    seal(filter_copy, SEALED)
     with pytest.raises(CheckpointError, match=r"(?s)do not fit.*critic\.q"):
         load(filter_copy)
 
@@ -167,14 +169,14 @@ def test_names_resolve_to_committed_folders(tmp_path, monkeypatch):
 
 def test_critic_that_was_never_trained_does_not_act(tiny_world_model):
     policy = load(tiny_world_model)
-    with pytest.raises(UntrainedFilterError, match=r"'world_model', 'reachability' is needed.*train-reachability"):
+    with pytest.raises(UntrainedFilterError, match=r"'world_model', 'critic' is needed.*train-reachability"):
         policy.select_action(tiny.observation([[0.9, 0.0, 0.0]]))
     with pytest.raises(UntrainedFilterError):
-        policy.value(policy.world_model.initial(1))
+        policy.model.value(policy.model.world_model.initial(1))
 
 
 def test_world_model_that_was_never_trained_gets_no_critic(cache_meta, tmp_path):
-    save_filter(tiny.new_policy(cache_meta), tmp_path / "fresh")
+    save_policy(tiny.new_policy(cache_meta), tmp_path / "fresh")
     with pytest.raises(UntrainedFilterError, match=r"'untrained', 'world_model' is needed.*lerobot-train"):
         train_reachability(tmp_path / "fresh", cache_meta, tmp_path / "out")
     assert not (tmp_path / "out").exists()
@@ -200,7 +202,7 @@ def test_filter_of_another_checkpoint_is_not_overwritten(tiny_world_model, tiny_
 def test_second_stage_leaves_world_model_and_margin_alone(tiny_world_model, tiny_filter):
     before, after = (load_file(folder / "model.safetensors") for folder in (tiny_world_model, tiny_filter))
     changed = {name for name in before if not torch.equal(before[name], after[name])}
-    assert changed and all(name.startswith("critic.") for name in changed)
+    assert changed and all(name.startswith("model.critic.") for name in changed)
 
 
 def test_equal_seeds_train_equal_filters(tiny_world_model, tiny_filter, cache_meta, tmp_path):
@@ -210,7 +212,7 @@ def test_equal_seeds_train_equal_filters(tiny_world_model, tiny_filter, cache_me
         load_file(f / "model.safetensors") for f in (tiny_filter, tmp_path / "same", tmp_path / "other")
     )
     assert all(torch.equal(reference[name], same[name]) for name in reference)
-    assert not torch.equal(reference["critic.q.0.weight"], other["critic.q.0.weight"])
+    assert not torch.equal(reference["model.critic.q.0.weight"], other["model.critic.q.0.weight"])
 
 
 def test_second_stage_needs_a_cache(tiny_world_model, dataset_meta, tmp_path):
@@ -246,7 +248,7 @@ def test_dataset_of_another_action_range_is_refused(tiny_world_model, cache_meta
     config = PreTrainedConfig.from_pretrained(tiny_world_model)
     action = {**cache_meta.stats["action"], "min": [low, 1.0], "max": [high, 1.0]}
     with pytest.raises(ValueError, match=r"turn_rate.vel of me/car.*trained on -1\.25 to 1\.25.*unit"):
-        adopt_dataset(config, cache_meta, {**cache_meta.stats, "action": action})
+        adopt_dataset(config.trained_on, cache_meta, {**cache_meta.stats, "action": action})
 
 
 def test_dataset_of_other_pictures_is_refused(tiny_world_model, dataset_meta):
@@ -259,14 +261,14 @@ def test_dataset_of_other_pictures_is_refused(tiny_world_model, dataset_meta):
 @pytest.mark.parametrize("candidates", [[[9.0, 1.0]], [[0.0, 1.0], [-1.3, 1.0]], [[0.0]], [[0.0, 1.0, 0.0]]])
 def test_action_candidates_outside_of_the_data_are_refused(cache_meta, candidates):
     with pytest.raises(ValueError, match=r"action candidate \[.*outside of what me/car covers"):
-        tiny.new_policy(cache_meta, action_candidates=candidates)
+        tiny.new_policy(cache_meta, fallback_action_candidates=candidates)
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"stage": "done"}, "'done'.*untrained"),
-        ({"mode": "watch"}, "'watch'.*monitor"),
+        ({"trained_on_stage": "done"}, "'done'.*untrained"),
+        ({"law_mode": "watch"}, "'watch'.*monitor"),
         ({"margin_delta": 0.0}, "positive"),
     ],
 )
@@ -284,21 +286,23 @@ def test_dataset_without_proprioception_is_refused(dataset_meta):
 
 def test_units_round_trip(policy):
     action = torch.tensor([[-1.25, 1.0], [0.3, 1.0]])
-    torch.testing.assert_close(policy.denormalise_action(policy.normalise_action(action)), action)
-    torch.testing.assert_close(policy.normalise_action(action)[:, 0], torch.tensor([-1.0, 0.24]))
-    assert policy.normalise_action(action)[:, 1].abs().max() < 1e-5  # a constant command sits in the middle
+    torch.testing.assert_close(
+        policy.model.units.denormalise_action(policy.model.units.normalise_action(action)), action
+    )
+    torch.testing.assert_close(policy.model.units.normalise_action(action)[:, 0], torch.tensor([-1.0, 0.24]))
+    assert policy.model.units.normalise_action(action)[:, 1].abs().max() < 1e-5  # a constant command sits in the middle
 
 
 # -- wrapped ---
 
 
 def test_alone_it_is_the_fallback_policy(policy):
-    policy.config.lookahead = 0
+    policy.config.law.lookahead = 0
     batch = tiny.observation([[-0.9, 0.0, 0.0], [0.2, 0.9, 1.0]])
     action = policy.select_action(batch)
     with torch.no_grad():
-        expected = policy.critic.fallback(policy.world_model.features(policy.shield.latent))
-    torch.testing.assert_close(action, policy.denormalise_action(expected))
+        expected = policy.model.critic.fallback(policy.model.world_model.features(policy.shield.latent))
+    torch.testing.assert_close(action, policy.model.units.denormalise_action(expected))
     policy.reset()
     assert policy.predict_action_chunk(batch).shape == (2, 1, 2)
 
@@ -306,21 +310,21 @@ def test_alone_it_is_the_fallback_policy(policy):
 def test_lookahead_outside_of_what_imagination_can_is_refused():
     for steps in (-1, 26):
         with pytest.raises(ValueError, match=rf"lookahead is {steps}; expected 0"):
-            tiny.config(lookahead=steps)
+            tiny.config(law_lookahead=steps)
 
 
-def test_guard_of_no_steps_is_refused():
-    with pytest.raises(ValueError, match=r"guard is 0; expected 1"):
-        tiny.config(guard=0)
+def test_proposal_of_no_steps_is_refused():
+    with pytest.raises(ValueError, match=r"proposal_steps is 0; expected 1"):
+        tiny.config(law_proposal_steps=0)
 
 
 def test_epsilon_above_everything_always_overrides(shielded):
-    shielded.config.epsilon = math.inf
+    shielded.config.law.epsilon = math.inf
     assert all(d.intervened.all() and d.reason.eq(Reason.UNSAFE_VALUE).all() for d in tiny.drive(shielded))
 
 
 def test_epsilon_below_everything_is_the_bare_policy(shielded):
-    shielded.config.epsilon = -math.inf
+    shielded.config.law.epsilon = -math.inf
     torch.manual_seed(0)
     decisions = tiny.drive(shielded)
     shielded.base.reset()
@@ -328,26 +332,26 @@ def test_epsilon_below_everything_is_the_bare_policy(shielded):
     states = np.array([(-0.9, 0.1, 0.0), (-0.7, -0.3, 0.5)])
     for t, decision in enumerate(decisions):
         torch.testing.assert_close(decision.action, shielded.base.propose(tiny.observation(states)))
-        states = tiny.dubins.step(states, np.full(2, 0.5 * (-1) ** t))
+        states = tiny.car.step(states, np.full(2, 0.5 * (-1) ** t))
     assert not any(d.intervened.any() for d in decisions)
 
 
 def test_monitor_mode_is_the_bare_policy_with_verdicts(shielded):
-    shielded.config.mode, shielded.config.epsilon = "monitor", math.inf
+    shielded.config.law.mode, shielded.config.law.epsilon = "monitor", math.inf
     for decision in tiny.drive(shielded):
         torch.testing.assert_close(decision.action, decision.proposed)
         assert decision.unsafe.all() and not decision.intervened.any()
 
 
 def test_base_policy_replans_after_an_intervention_and_only_then(shielded):
-    shielded.config.epsilon = -math.inf
+    shielded.config.law.epsilon = -math.inf
     tiny.drive(shielded, n_steps=2)
     planned = list(shielded.base.policy._queues["action"])
     assert len(planned) == 2
     here = tiny.observation([(-0.9, 0.1, 0.0), (-0.7, -0.3, 0.5)])
     assert torch.equal(shielded.decide(here).action[:, 0], shielded.base.postprocessor(planned[0])[:, 0])
     assert len(shielded.base.policy._queues["action"]) == 1
-    shielded.config.epsilon = math.inf
+    shielded.config.law.epsilon = math.inf
     shielded.base.policy._queues["action"].append(planned[0])
     shielded.decide(here)
     assert len(shielded.base.policy._queues["action"]) == 0
@@ -362,7 +366,7 @@ def test_policy_without_a_known_queue_is_reset_to_replan(shielded, monkeypatch):
 
 
 def test_base_policy_that_fails_is_replaced_by_the_fallback(shielded, monkeypatch, caplog):
-    shielded.config.epsilon = -math.inf
+    shielded.config.law.epsilon = -math.inf
     monkeypatch.setattr(shielded.base.policy, "select_action", lambda *_: 1 / 0)
     decision = shielded.decide(tiny.observation([[-0.9, 0.1, 0.0]]))
     assert decision.intervened.all() and decision.reason.eq(Reason.BASE_POLICY_FAILED).all()
@@ -371,14 +375,14 @@ def test_base_policy_that_fails_is_replaced_by_the_fallback(shielded, monkeypatc
 
 
 def test_base_policy_that_fails_is_an_error_in_monitor_mode(shielded, monkeypatch):
-    shielded.config.mode = "monitor"
+    shielded.config.law.mode = "monitor"
     monkeypatch.setattr(shielded.base.policy, "select_action", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         shielded.decide(tiny.observation([[-0.9, 0.1, 0.0]]))
 
 
 def test_nan_from_the_base_policy_falls_back(shielded, monkeypatch):
-    shielded.config.epsilon = -math.inf
+    shielded.config.law.epsilon = -math.inf
     monkeypatch.setattr(shielded.base, "propose", lambda _: torch.tensor([[math.nan, 1.0]]))
     decision = shielded.decide(tiny.observation([[-0.9, 0.1, 0.0]]))
     assert decision.reason.item() == Reason.ACTION_NOT_FINITE and decision.action.isfinite().all()
@@ -413,7 +417,7 @@ def test_wrapped_folder_is_self_contained(tiny_filter, tiny_diffusion, tmp_path)
     base = shutil.copytree(tiny_diffusion, tmp_path / "base")
     policy = load(tiny_filter)
     policy.attach(base)
-    save_filter(policy, tmp_path / "wrapped")
+    save_policy(policy, tmp_path / "wrapped")
     shutil.rmtree(base)
     moved = shutil.move(tmp_path / "wrapped", tmp_path / "elsewhere")
     assert json.loads((moved / "config.json").read_text())["base_policy_path"] == "base_policy"
@@ -426,16 +430,16 @@ def test_wrapped_folder_is_self_contained(tiny_filter, tiny_diffusion, tmp_path)
 
 
 def test_wrapped_folder_can_be_wrapped_again(shielded, tmp_path):
-    save_filter(shielded, tmp_path / "first", half=True)
+    save_policy(shielded, tmp_path / "first", half=True)
     again = load(tmp_path / "first")
-    again.config.epsilon = 0.25
-    save_filter(again, tmp_path / "second")
+    again.config.law.epsilon = 0.25
+    save_policy(again, tmp_path / "second")
     third = load(tmp_path / "second")
-    assert third.config.epsilon == 0.25 and third.base.config.type == "diffusion"
+    assert third.config.law.epsilon == 0.25 and third.base.config.type == "diffusion"
 
 
 def test_wrapped_folder_without_its_base_policy_is_refused(shielded, tmp_path):
-    save_filter(shielded, tmp_path / "wrapped")
+    save_policy(shielded, tmp_path / "wrapped")
     shutil.rmtree(tmp_path / "wrapped" / "base_policy")
     with pytest.raises(CheckpointError, match="base_policy"):
         load(tmp_path / "wrapped")
@@ -446,8 +450,8 @@ def test_wrapped_folder_without_its_base_policy_is_refused(shielded, tmp_path):
 
 @pytest.fixture
 def wrapped(shielded, tmp_path):
-    shielded.config.epsilon = 0.0
-    save_filter(shielded, tmp_path / "wrapped")
+    shielded.config.law.epsilon = 0.0
+    save_policy(shielded, tmp_path / "wrapped")
     return tmp_path / "wrapped"
 
 
@@ -495,14 +499,16 @@ def test_outer_processors_change_no_number(tiny_filter):
 
 
 def test_fallback_moves_only_the_commands_it_may(cache_meta):
-    both = tiny.new_policy(cache_meta, action_candidates=None)
-    assert (both.critic.high > both.critic.low).tolist() == [True, False]  # the speed never varies
-    none = tiny.new_policy(cache_meta, action_candidates=None, fallback_moves=["speed.vel"])
-    assert not (none.critic.high > none.critic.low).any()
-    one_way = tiny.new_policy(cache_meta, action_candidates=None, fallback_moves=["-turn_rate.vel"]).critic
+    both = tiny.new_policy(cache_meta, fallback_action_candidates=None)
+    assert (both.model.critic.high > both.model.critic.low).tolist() == [True, False]  # the speed never varies
+    none = tiny.new_policy(cache_meta, fallback_action_candidates=None, fallback_moves=["speed.vel"])
+    assert not (none.model.critic.high > none.model.critic.low).any()
+    one_way = tiny.new_policy(
+        cache_meta, fallback_action_candidates=None, fallback_moves=["-turn_rate.vel"]
+    ).model.critic
     assert (one_way.low.tolist(), one_way.high.tolist()) == ([-1, 0], [0, 0])
     assert one_way.held_actions().tolist() == [[0, 0], [-1, 0]]
     with pytest.raises(ValueError, match=r"no action is named lift; there are turn_rate\.vel"):
-        tiny.new_policy(cache_meta, action_candidates=None, fallback_moves=["lift"])
+        tiny.new_policy(cache_meta, fallback_action_candidates=None, fallback_moves=["lift"])
     with pytest.raises(ValueError, match=r"no action is named -turn_rate\.vel"):
-        tiny.new_policy(cache_meta, action_candidates=None, fallback_moves=["--turn_rate.vel"])
+        tiny.new_policy(cache_meta, fallback_action_candidates=None, fallback_moves=["--turn_rate.vel"])

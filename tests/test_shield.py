@@ -5,8 +5,9 @@ import pytest
 import tiny
 import torch
 
+from lerobot_latentsafe.critic import FallbackConfig
 from lerobot_latentsafe.datasets.clips import Clip
-from lerobot_latentsafe.decision import Reason
+from lerobot_latentsafe.decision import LawConfig, Reason
 from lerobot_latentsafe.shield import Shield
 
 IMAGE = "observation.image"
@@ -27,28 +28,28 @@ def actions(*rows):
 @pytest.fixture
 def permissive(policy):
     """Passes whatever is not faulty."""
-    policy.config.epsilon = -math.inf
+    policy.config.law.epsilon = -math.inf
     return policy
 
 
 @pytest.fixture
 def strict(policy):
     """Passes nothing."""
-    policy.config.epsilon = math.inf
+    policy.config.law.epsilon = math.inf
     return policy
 
 
 def encode(policy, observations, taken):
     """The world model's latent after a clip of observations, with the actions that led to each."""
-    images = torch.stack([policy.model_images(o[IMAGE]) for o in observations], 1)
-    state = torch.stack([policy.normalise_state(o["observation.state"]) for o in observations], 1)
-    action = policy.normalise_action(torch.stack(taken, 1))
+    images = torch.stack([policy.model.images(o[IMAGE]) for o in observations], 1)
+    state = torch.stack([policy.model.units.normalise_state(o["observation.state"]) for o in observations], 1)
+    action = policy.model.units.normalise_action(torch.stack(taken, 1))
     is_first = torch.zeros(state.shape[:2], dtype=torch.bool)
     is_first[:, 0] = True
     action = torch.cat([torch.zeros_like(action[:, :1]), action], 1)
     none = torch.zeros_like(is_first, dtype=torch.long)
     with torch.no_grad():
-        latents = policy.world_model.encode(Clip({IMAGE: images}, state, action, is_first, ~is_first, none, none))
+        latents = policy.model.world_model.encode(Clip({IMAGE: images}, state, action, is_first, ~is_first, none, none))
     return {key: value[:, -1] for key, value in latents.items()}
 
 
@@ -69,8 +70,8 @@ def test_history_is_the_world_models_encoding_of_the_clip(permissive):
 
 
 @pytest.mark.parametrize(("memory", "remembered"), [(0, 7), (4, 3), (5, 3), (6, 4), (12, 7)])
-def test_memory_is_of_the_last_frames_only(permissive, memory, remembered):
-    permissive.config.memory = memory
+def test_history_is_of_the_last_frames_only_if_asked(permissive, memory, remembered):
+    permissive.config.law.history_frames = memory
     observations, taken = along(7), [actions(LEFT), actions(STRAIGHT), actions(LEFT, RIGHT, STRAIGHT)] * 2
     for observation, action in zip(observations, [*taken, actions(STRAIGHT)]):
         permissive.shield(observation, action)
@@ -92,10 +93,10 @@ def test_executed_actions_enter_the_history_not_proposed_ones(strict):
 def test_value_is_that_of_the_next_latent_under_the_proposed_action(permissive):
     observation = along(1)[0]
     decision = permissive.shield(observation, actions(LEFT))
-    model, latent = permissive.world_model, permissive.shield.latent
+    model, latent = permissive.model.world_model, permissive.shield.latent
     with torch.no_grad():
-        after = permissive.value(model.step(latent, permissive.normalise_action(actions(LEFT))))
-        now = permissive.margin.bounded(model.features(latent))
+        after = permissive.model.value(model.step(latent, permissive.model.units.normalise_action(actions(LEFT))))
+        now = permissive.model.margin.bounded(model.features(latent))
     torch.testing.assert_close(decision.value, torch.minimum(after, now))
     torch.testing.assert_close(decision.margin, now)
 
@@ -137,7 +138,7 @@ def test_blind_steps_go_on_by_imagination_and_sight_recovers(permissive):
     observations[1][IMAGE][:] = math.nan
     permissive.shield(observations[1], actions(LEFT))
     with torch.no_grad():
-        imagined = permissive.world_model.step(before, permissive.normalise_action(actions(LEFT)))
+        imagined = permissive.model.world_model.step(before, permissive.model.units.normalise_action(actions(LEFT)))
     assert_same(permissive.shield.latent, imagined)
     for observation in observations[2:]:
         decision = permissive.shield(observation, actions(LEFT))
@@ -205,7 +206,7 @@ def test_stale_observation_does_not_enter_the_history(permissive):
     before = {key: value.clone() for key, value in permissive.shield.latent.items()}
     permissive.shield(second, actions(LEFT), age_s=1.0)
     with torch.no_grad():
-        imagined = permissive.world_model.step(before, permissive.normalise_action(actions(LEFT)))
+        imagined = permissive.model.world_model.step(before, permissive.model.units.normalise_action(actions(LEFT)))
     assert_same(permissive.shield.latent, imagined)
 
 
@@ -253,8 +254,8 @@ def test_first_fault_is_the_one_reported(permissive):
 @pytest.mark.parametrize(("took_ms", "missed"), [(9, False), (11, True)])
 def test_missed_deadline_falls_back(permissive, took_ms, missed):
     times = iter([0.0, took_ms / 1e3])
-    permissive.config.deadline_ms = 10
-    permissive.shield = Shield(permissive, clock=lambda: next(times))
+    permissive.config.law.deadline_ms = 10
+    permissive.shield = Shield(permissive.model, clock=lambda: next(times))
     decision = permissive.shield(along(1)[0], actions(LEFT))
     assert decision.reason.tolist() == [Reason.DEADLINE_MISSED if missed else Reason.PASSED] * 3
     assert decision.intervened.tolist() == [missed] * 3
@@ -262,29 +263,29 @@ def test_missed_deadline_falls_back(permissive, took_ms, missed):
 
 @pytest.mark.parametrize("lookahead", [0, 3])
 def test_fallback_is_the_plans_first_action_in_robot_units(strict, lookahead):
-    strict.config.lookahead = lookahead
+    strict.config.law.lookahead = lookahead
     decision = strict.shield(along(1)[0], actions([0.3, 1.0]))
     with torch.no_grad():
         latent = strict.shield.latent
-        expected = strict.denormalise_action(strict.plan(latent)[1])
+        expected = strict.model.units.denormalise_action(strict.model.plan(latent)[1])
         if not lookahead:
-            critics = strict.critic.fallback(strict.world_model.features(latent))
-            torch.testing.assert_close(expected, strict.denormalise_action(critics))
+            critics = strict.model.critic.fallback(strict.model.world_model.features(latent))
+            torch.testing.assert_close(expected, strict.model.units.denormalise_action(critics))
     torch.testing.assert_close(decision.action, expected)
     assert all(action in [*map(tuple, tiny.CANDIDATES)] for action in map(tuple, decision.action.tolist()))
 
 
-def test_guard_of_one_is_the_papers_law_and_more_steps_look_further(strict):
+def test_one_step_is_the_papers_law_and_more_steps_look_further(strict):
     latents, margins = [], []
     for guard in (1, 3):
-        strict.config.guard = guard
+        strict.config.law.proposal_steps = guard
         strict.shield.reset()
         strict.shield(along(1)[0], actions(LEFT))
-        action = strict.normalise_action(actions(LEFT))
+        action = strict.model.units.normalise_action(actions(LEFT))
         latent, least = strict.shield._go_on(strict.shield.latent, action)
         expected = strict.shield.latent
         for _ in range(guard):
-            expected = strict.world_model.step(expected, action)
+            expected = strict.model.world_model.step(expected, action)
         torch.testing.assert_close(latent["h"], expected["h"])
         latents.append(latent["h"])
         margins.append(least)
@@ -298,7 +299,7 @@ def test_once_the_filter_acts_the_policy_is_released_above_another_value(permiss
     for acting, release in ((False, 1.0), (True, value.min().item() - 1e-3), (True, value.max().item() + 1e-3)):
         shield.reset()
         shield._forget_overrides(3)
-        config.release, shield.recent[:, -1] = release, acting
+        config.law.resume_above, shield.recent[:, -1] = release, acting
         assert (shield(along(1)[0], actions(LEFT)).intervened == (release > value) & acting).all()
         assert shield.recent[:, -2].all() == acting
 
@@ -312,7 +313,7 @@ def retreats(decision):
 
 def test_after_some_overrides_the_retreat_acts_and_goes_on(permissive):
     config, shield = permissive.config, permissive.shield
-    config.retreat, config.patience, config.dwell = RETREAT, 2, 3
+    config.law.retreat, config.law.retreat_after, config.law.min_retreat_steps = RETREAT, 2, 3
     one = actions(OUTSIDE, LEFT, LEFT)
     for proposed, acts, retreat in (
         (one, True, False),  # the critic's action is tried twice,
@@ -332,7 +333,7 @@ def test_after_some_overrides_the_retreat_acts_and_goes_on(permissive):
 
 
 def test_overrides_of_long_ago_do_not_count(permissive):
-    permissive.config.retreat, permissive.config.patience = RETREAT, 1
+    permissive.config.law.retreat, permissive.config.law.retreat_after = RETREAT, 1
     for pause, retreat in ((8, True), (10, False)):
         permissive.shield.reset()
         permissive.shield(along(1)[0], actions(OUTSIDE))
@@ -345,14 +346,14 @@ def test_retreat_is_a_move_of_the_fallback_not_of_v(tiny_continuous_filter):
     from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 
     policy = LatentSafePolicy.from_pretrained(tiny_continuous_filter).eval()
-    policy.config.epsilon, policy.config.dwell = math.inf, 5
+    policy.config.law.epsilon, policy.config.law.min_retreat_steps = math.inf, 5
     before = policy.shield(along(1)[0], actions([0.3, 1.0]))
     policy.shield.reset()
-    policy.config.retreat = RETREAT
+    policy.config.law.retreat = RETREAT
     decision = policy.shield(along(1)[0], actions([0.3, 1.0]))
     assert retreats(decision) == [True] * 3 and retreats(before) == [False] * 3
     torch.testing.assert_close(decision.value, before.value)
-    policy.config.mode = "monitor"
+    policy.config.law.mode = "monitor"
     policy.shield.reset()
     assert not policy.shield(along(1)[0], actions([0.3, 1.0])).intervened.any()
     assert not policy.shield.recent.any() and not policy.shield.retreated.any()
@@ -362,8 +363,8 @@ def test_retreat_is_a_move_of_the_fallback_not_of_v(tiny_continuous_filter):
     ("retreat", "wrong"),
     [
         ({"down.pos": -0.1}, r"retreat moves down.pos; the actions are turn_rate.vel"),
-        ({"turn_rate.vel": 9.0}, r"retreat turn_rate.vel is 9; the filter was trained on -1.25 to 1.25"),
-        ({"turn_rate.vel": math.nan}, r"retreat turn_rate.vel is nan"),
+        ({"turn_rate.vel": 9.0}, r"retreat moves turn_rate.vel by 9; the filter was trained on -1.25 to 1.25"),
+        ({"turn_rate.vel": math.nan}, r"retreat moves turn_rate.vel by nan"),
     ],
 )
 def test_retreat_that_cannot_be_is_refused(tiny_continuous_filter, retreat, wrong):
@@ -371,15 +372,17 @@ def test_retreat_that_cannot_be_is_refused(tiny_continuous_filter, retreat, wron
 
     policy = LatentSafePolicy.from_pretrained(tiny_continuous_filter)
     with pytest.raises(ValueError, match=wrong):
-        replace(policy.config, retreat=retreat)
-    policy.config.retreat = retreat
+        policy.config.change(law=replace(policy.config.law, retreat=retreat))
+    assert not policy.config.law.retreat
+    policy.config.law.retreat = retreat
     with pytest.raises(ValueError, match=wrong):
         LatentSafePolicy(policy.config)
 
 
-def test_retreat_leaves_kept_commands_alone(policy):
-    with pytest.raises(ValueError, match=r"moves turn_rate.vel, one of kept_commands"):
-        replace(policy.config, kept_commands=["turn_rate.vel"], retreat=RETREAT)
+def test_retreat_leaves_frozen_commands_alone(policy):
+    law, fallback = replace(policy.config.law, retreat=RETREAT), FallbackConfig(frozen_commands=["turn_rate.vel"])
+    with pytest.raises(ValueError, match=r"moves turn_rate.vel, one of fallback.frozen_commands"):
+        policy.config.change(law=law, fallback=fallback)
 
 
 def test_what_was_executed_instead_is_remembered(policy):
@@ -387,7 +390,7 @@ def test_what_was_executed_instead_is_remembered(policy):
         policy.shield.reset()
         policy.shield(along(1)[0], actions(LEFT))
         policy.shield.was_executed(told)
-        predicted = policy.world_model.step(policy.shield.latent, policy.normalise_action(told))
+        predicted = policy.model.world_model.step(policy.shield.latent, policy.model.units.normalise_action(told))
         policy.shield(along(1)[0], actions(LEFT))
         torch.testing.assert_close(policy.shield.latent["h"], predicted["h"])
 
@@ -395,24 +398,24 @@ def test_what_was_executed_instead_is_remembered(policy):
 @pytest.mark.parametrize(
     ("name", "wrong", "expected"),
     [
-        ("release", 1.0, "less than 1"),
-        ("release", math.nan, "less than 1"),
-        ("dwell", 0, "at least 1 step"),
-        ("patience", 11, "10 overrides"),
-        ("memory", 1, "at least 2 frames"),
-        ("memory", -4, "at least 2 frames"),
+        ("resume_above", 1.0, "less than 1"),
+        ("resume_above", math.nan, "less than 1"),
+        ("min_retreat_steps", 0, "at least 1 step"),
+        ("retreat_after", 11, "10 overrides"),
+        ("history_frames", 1, "at least 2 frames"),
+        ("history_frames", -4, "at least 2 frames"),
     ],
 )
-def test_settings_that_make_no_sense_are_refused(policy, name, wrong, expected):
-    with pytest.raises(ValueError, match=rf"--policy.{name} is {wrong}; .*{expected}"):
-        replace(policy.config, **{name: wrong})
+def test_settings_that_make_no_sense_are_refused(name, wrong, expected):
+    with pytest.raises(ValueError, match=rf"--policy.law.{name} is {wrong}; .*{expected}"):
+        LawConfig(**{name: wrong})
 
 
 def test_continuous_fallback_stays_in_range(tiny_continuous_filter):
     from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 
     policy = LatentSafePolicy.from_pretrained(tiny_continuous_filter)
-    policy.config.epsilon = math.inf
+    policy.config.law.epsilon = math.inf
     action = policy.shield(along(1)[0], actions([0.3, 1.0])).action
     assert action[:, 0].abs().max() <= 1.25
     torch.testing.assert_close(action[:, 1], torch.ones(3))
@@ -420,21 +423,26 @@ def test_continuous_fallback_stays_in_range(tiny_continuous_filter):
 
 def test_robot_is_held_when_even_the_latent_is_not_finite(permissive):
     with torch.no_grad():
-        permissive.world_model.posterior_out.bias.fill_(math.nan)
-    for permissive.config.retreat in ({}, RETREAT):
+        permissive.model.world_model.posterior_out.bias.fill_(math.nan)
+    for permissive.config.law.retreat in ({}, RETREAT):
         decision = permissive.shield(along(1)[0], actions(LEFT))
         assert decision.reason.eq(Reason.VALUE_NOT_FINITE).all()
-        torch.testing.assert_close(decision.action, permissive.hold_action(3))
+        torch.testing.assert_close(decision.action, permissive.model.units.hold_action(3))
 
 
 def test_hold_is_zero_motion_or_the_nearest_the_range_allows(policy):
-    torch.testing.assert_close(policy.hold_action(2), torch.tensor([[0.0, 1.0]] * 2))  # the speed never varies
-    policy.action_low[:], policy.action_high[:] = torch.tensor([0.2, 1.0]), torch.tensor([0.9, 1.0])
-    torch.testing.assert_close(policy.hold_action(1), torch.tensor([[0.2, 1.0]]))
+    torch.testing.assert_close(
+        policy.model.units.hold_action(2), torch.tensor([[0.0, 1.0]] * 2)
+    )  # the speed never varies
+    policy.model.units.action_low[:], policy.model.units.action_high[:] = (
+        torch.tensor([0.2, 1.0]),
+        torch.tensor([0.9, 1.0]),
+    )
+    torch.testing.assert_close(policy.model.units.hold_action(1), torch.tensor([[0.2, 1.0]]))
 
 
 def test_monitor_mode_lets_everything_through_and_reports(strict):
-    strict.config.mode = "monitor"
+    strict.config.law.mode = "monitor"
     proposed = actions(LEFT, [9.0, 1.0], STRAIGHT)
     decision = strict.shield(along(1)[0], proposed)
     torch.testing.assert_close(decision.action, proposed)
@@ -444,7 +452,7 @@ def test_monitor_mode_lets_everything_through_and_reports(strict):
 
 @pytest.mark.parametrize(("mode", "does"), [("filter", "acts"), ("monitor", "would act")])
 def test_the_first_override_of_an_episode_is_logged(strict, caplog, mode, does):
-    strict.config.mode = mode
+    strict.config.law.mode = mode
     for _ in range(2):
         strict.reset()
         with caplog.at_level("INFO"):
@@ -459,14 +467,14 @@ def test_fallback_keeps_its_grip(cache_meta, tmp_path):
     from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
     from lerobot_latentsafe.training import train_reachability
 
-    options = dict(action_candidates=None, kept_commands=["turn_rate.vel"])
+    options = dict(fallback_action_candidates=None, fallback_frozen_commands=["turn_rate.vel"])
     stage_one = tiny.train_stage_one(cache_meta, tmp_path / "one", **options)
     train_reachability(stage_one, cache_meta, tmp_path / "two")
     policy = LatentSafePolicy.from_pretrained(tmp_path / "two")
     seen = tiny.observation([[-0.9, 0.1, 0.0]])
-    policy.config.epsilon = -2.0  # all passes
+    policy.config.law.epsilon = -2.0  # all passes
     assert policy.shield(seen, torch.tensor([[0.7, 1.0]])).action[0, 0] == pytest.approx(0.7)
-    policy.config.epsilon = 2.0  # nothing passes
+    policy.config.law.epsilon = 2.0  # nothing passes
     for _ in range(2):
         decision = policy.shield(seen, torch.tensor([[-1.0, 1.0]]))
         assert decision.intervened.all() and decision.action[0, 0] == pytest.approx(0.7, abs=1e-5)
@@ -478,7 +486,7 @@ def test_before_anything_was_executed_the_grip_is_that_which_is_seen(tmp_path):
     from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES
     from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 
-    policy = LatentSafePolicy.from_pretrained(tiny.save_franka_filter(tmp_path / "filter", epsilon=2.0))
+    policy = LatentSafePolicy.from_pretrained(tiny.save_franka_filter(tmp_path / "filter", law_epsilon=2.0))
     assert "gripper.pos" in STATE_NAMES
     state = torch.zeros(2, len(STATE_NAMES))
     state[:, STATE_NAMES.index("gripper.pos")] = torch.tensor([0.8, 1.2])  # beyond what can be commanded
@@ -492,20 +500,21 @@ def test_before_anything_was_executed_the_grip_is_that_which_is_seen(tmp_path):
 
 @pytest.mark.parametrize("law", ["plan", "margin"])
 def test_baseline_laws_need_no_critic(tiny_world_model, law):
-    from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, UntrainedFilterError
+    from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+    from lerobot_latentsafe.safety_model import UntrainedFilterError
 
     policy = LatentSafePolicy.from_pretrained(tiny_world_model)
     seen, proposed = tiny.observation([[-0.9, 0.1, 0.0]]), torch.tensor([[0.0, 1.0]])
     with pytest.raises(UntrainedFilterError, match="safety critic was never"):
         policy.shield(seen, proposed)
-    policy.config.law = law
+    policy.config.law.name = law
     decision = policy.shield(seen, proposed)
     assert decision.value.isfinite().all()
     if law == "margin":
-        policy.config.epsilon = 2.0
-        torch.testing.assert_close(policy.shield(seen, proposed).action, policy.hold_action(1))
+        policy.config.law.epsilon = 2.0
+        torch.testing.assert_close(policy.shield(seen, proposed).action, policy.model.units.hold_action(1))
 
 
 def test_unknown_law_is_refused():
-    with pytest.raises(ValueError, match=r"law is 'luck'; expected one of reachability, risk, plan, margin"):
-        tiny.config(law="luck")
+    with pytest.raises(ValueError, match=r"law.name is 'luck'; expected one of reachability, risk, plan, margin"):
+        tiny.config(law_name="luck")

@@ -11,10 +11,15 @@ import pytest
 import torch
 
 from lerobot_latentsafe import LatentSafeConfig
-from lerobot_latentsafe.critic import ReachabilityConfig
+from lerobot_latentsafe.critic import FallbackConfig, ReachabilityConfig
 from lerobot_latentsafe.datasets.clips import Clip
+from lerobot_latentsafe.decision import LawConfig
 from lerobot_latentsafe.dubins import car
+from lerobot_latentsafe.margin import MarginConfig
+from lerobot_latentsafe.units import TrainedOn
 from lerobot_latentsafe.world_models import RSSMConfig
+
+GROUPS = {"margin": MarginConfig, "fallback": FallbackConfig, "law": LawConfig, "trained_on": TrainedOn}
 
 REPO_ID = "me/car"
 ACTION_DIM = 2
@@ -69,11 +74,16 @@ def dino_wm_config(**changes):
 
 
 def config(**changes):
+    """A filter's configuration; entries of its groups are given by `<group>_<entry>`, such as law_epsilon."""
     options = dict(
-        world_model=rssm_config(), reachability=reachability_config(), action_candidates=CANDIDATES, device="cpu",
-        push_to_hub=False,
+        world_model=rssm_config(), reachability=reachability_config(), fallback_action_candidates=CANDIDATES,
+        device="cpu", push_to_hub=False,
     )  # fmt: skip
-    return LatentSafeConfig(**{**options, **changes})
+    options |= changes
+    for group, kind in GROUPS.items():
+        entries = {name: options.pop(name) for name in list(options) if name.startswith(f"{group}_")}
+        options[group] = kind(**{name.removeprefix(f"{group}_"): value for name, value in entries.items()})
+    return LatentSafeConfig(**options)
 
 
 def metadata(root, repo_id=REPO_ID):
@@ -105,7 +115,7 @@ def new_policy(meta, **changes):
 
 def train_stage_one(meta, folder, steps=5, **changes):
     """A few gradient steps on world model and margin, then save as lerobot-train does."""
-    from lerobot_latentsafe.runtime.checkpoint import save_filter
+    from lerobot_latentsafe.runtime.hub import save_policy
 
     torch.manual_seed(0)
     policy = new_policy(meta, **changes).train()
@@ -115,7 +125,7 @@ def train_stage_one(meta, folder, steps=5, **changes):
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    save_filter(policy, Path(folder))
+    save_policy(policy, Path(folder))
     return folder
 
 
@@ -126,21 +136,23 @@ def save_franka_filter(folder, scene="blocks", **changes):
     from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES, action_limits
     from lerobot_latentsafe.franka.scenes import SCENES
     from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
-    from lerobot_latentsafe.runtime.checkpoint import save_filter
+    from lerobot_latentsafe.runtime.hub import save_policy
 
     torch.manual_seed(0)
     cameras = [f"observation.images.{name}" for name in ("front", "wrist")]
     low, high = action_limits(SCENES[scene].fps)
     images = {key: PolicyFeature(FeatureType.VISUAL, (3, 32, 32)) for key in cameras}
     options = dict(
-        action_candidates=None, cameras=cameras, fps=SCENES[scene].fps, stage="reachability",
+        fallback_action_candidates=None, fallback_frozen_commands=["gripper.pos"], law_lookahead=0,
+        trained_on_cameras=cameras, trained_on_fps=SCENES[scene].fps, trained_on_stage="critic",
         input_features={**images, "observation.state": PolicyFeature(FeatureType.STATE, (len(STATE_NAMES),))},
         output_features={"action": PolicyFeature(FeatureType.ACTION, (len(ACTION_NAMES),))},
-        state_names=STATE_NAMES, action_names=ACTION_NAMES, kept_commands=["gripper.pos"], lookahead=0,
-        action_low=low.tolist(), action_high=high.tolist(), action_varies=[True] * len(ACTION_NAMES),
-        state_mean=[0.0] * len(STATE_NAMES), state_std=[1.0] * len(STATE_NAMES),
+        trained_on_state_names=STATE_NAMES, trained_on_action_names=ACTION_NAMES,
+        trained_on_action_low=low.tolist(), trained_on_action_high=high.tolist(),
+        trained_on_action_varies=[True] * len(ACTION_NAMES), trained_on_state_mean=[0.0] * len(STATE_NAMES),
+        trained_on_state_std=[1.0] * len(STATE_NAMES),
     )  # fmt: skip
-    save_filter(LatentSafePolicy(config(**{**options, **changes})), Path(folder))
+    save_policy(LatentSafePolicy(config(**{**options, **changes})), Path(folder))
     return folder
 
 
@@ -224,6 +236,12 @@ def rewrite_json(path, **changes):
     path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
 
 
+def rewrite_group(folder, group, **changes):
+    """Set entries of a group of a checkpoint's configuration."""
+    file = Path(folder) / "config.json"
+    rewrite_json(file, **{group: {**json.loads(file.read_text())[group], **changes}})
+
+
 BLOCKS_FRAMES = 12
 
 
@@ -248,8 +266,8 @@ def dreamer_options(output_dir, **changes):
 
     behavior = BehaviorConfig(hidden=16, bins=17, horizon=3, starts=8)
     model = config(
-        world_model=rssm_config(image_size=16, classes=4, clip_length=6), action_candidates=None, lookahead=0,
-        kept_commands=["gripper.pos"], margin_layers=3,
+        world_model=rssm_config(image_size=16, classes=4, clip_length=6), fallback_action_candidates=None,
+        fallback_frozen_commands=["gripper.pos"], law_lookahead=0, margin_layers=3,
     )  # fmt: skip
     policy = LatentSafeDreamerConfig(behavior=behavior, device="cpu", push_to_hub=False)
     options = dict(
