@@ -3,8 +3,6 @@
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import draccus
-from draccus.parsers.decoding import decode_dataclass
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import NormalizationMode
 from lerobot.optim import AdamConfig, CosineDecayWithWarmupSchedulerConfig
@@ -12,7 +10,6 @@ from lerobot.optim import AdamConfig, CosineDecayWithWarmupSchedulerConfig
 from lerobot_latentsafe.critic import BACKUPS, FallbackConfig, ReachabilityConfig
 from lerobot_latentsafe.decision import LawConfig
 from lerobot_latentsafe.margin import MarginConfig
-from lerobot_latentsafe.runtime.checkpoint import CheckpointError
 from lerobot_latentsafe.units import TrainedOn
 from lerobot_latentsafe.world_models import RSSMConfig, WorldModelConfig
 
@@ -153,23 +150,3 @@ class LatentSafeConfig(PreTrainedConfig):
             raise ValueError("latentsafe needs observation.state (proprioception); the dataset has none")
         if not self.action_feature:
             raise ValueError("latentsafe needs an action feature; the dataset has none")
-
-
-def require_present_layout(config: dict[str, Any], where: str = "this checkpoint") -> None:
-    """Refuse the flat layout of versions before 0.2, whose entries have other names now.
-
-    Raises:
-        CheckpointError: naming the command that migrates it.
-    """
-    if "margin_hidden" in config or "epsilon" in config:
-        raise CheckpointError(
-            f"{where} has the configuration of a version before 0.2. Migrate it once: latentsafe migrate-checkpoint "
-            "--policy.path=<this checkpoint> --output_dir=<a new folder>"
-        )
-
-
-@draccus.decode.register(LatentSafeConfig)
-def _decode(raw: dict[str, Any], path: tuple[str, ...] = ()) -> LatentSafeConfig:
-    """What LeRobot's commands call to read a config.json."""
-    require_present_layout(raw)
-    return decode_dataclass(LatentSafeConfig, raw, path)

@@ -10,6 +10,8 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
+from lerobot_latentsafe.runtime.checkpoint import OldLayoutError
+
 
 def safety_bellman_target(margin: Tensor, next_value: Tensor, gamma: float) -> Tensor:
     """Eq. 5, the time-discounted safety Bellman backup: (1 - gamma) l + gamma min(l, V').
@@ -100,6 +102,7 @@ class ReachabilityConfig:
         pool: imagined states kept; a part is imagined anew every `refresh` steps.
         greedy: share of imagined trajectories that follow the current fallback policy, which lets imagination visit
             what the fallback would see; the others act at random, each action held for 1 / `switch` steps on average.
+        kept: of configurations before 0.2, which are refused: LeRobot's commands read this group of them first.
     """
 
     critic_hidden: tuple[int, ...] = (128, 128, 128)
@@ -124,8 +127,14 @@ class ReachabilityConfig:
     refresh: int = 250
     greedy: float = 0.5
     switch: float = 0.1
+    kept: int | None = None
 
     def __post_init__(self) -> None:
+        if self.kept is not None:
+            raise OldLayoutError(
+                "this configuration is of a version before 0.2. Migrate the checkpoint once: latentsafe "
+                "migrate-checkpoint --policy.path=<old folder> --output_dir=<new folder>"
+            )
         if self.actor_through not in ("critic", "world_model"):
             raise ValueError(f"actor_through is {self.actor_through!r}; expected critic or world_model")
 

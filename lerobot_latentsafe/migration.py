@@ -53,8 +53,9 @@ def migrated(config: dict[str, Any]) -> dict[str, Any]:
             groups[name] = value
     if groups["trained_on"].get("stage") == "reachability":
         groups["trained_on"]["stage"] = "critic"
-    if "kept" in groups.get("reachability", {}):
-        groups["reachability"]["learned_steps"] = groups["reachability"].pop("kept")
+    reachability = groups.get("reachability", {})
+    if "kept" in reachability:
+        reachability["learned_steps"] = reachability.pop("kept")
     return groups
 
 

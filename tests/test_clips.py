@@ -8,8 +8,8 @@ from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_latentsafe.datasets.build_cache import build_frame_cache
-from lerobot_latentsafe.datasets.clips import ClipReader
 from lerobot_latentsafe.datasets.labels import UnlabelledDatasetError
+from lerobot_latentsafe.modeling_latentsafe import adopt
 
 LENGTHS = (11, 9)
 N = sum(LENGTHS)
@@ -51,12 +51,12 @@ def record_counting(root, width=2):
 def reading(root):
     """Reads clips of a counting dataset by the frame they start at; `.policy` is whom they are read for."""
     meta = tiny.metadata(root, "me/counting")
-    policy = tiny.new_policy(meta, world_model=tiny.rssm_config(image_size=8), action_candidates=None)
+    policy = tiny.new_policy(meta, world_model=tiny.rssm_config(image_size=8), fallback_action_candidates=None)
     windows = resolve_delta_timestamps(policy.config, meta)
     dataset = LeRobotDataset("me/counting", root=root, delta_timestamps=windows)
 
     def read(*starts):
-        return policy.reader.read(torch.utils.data.default_collate([dataset[i] for i in starts]), policy)
+        return policy.reader.read(torch.utils.data.default_collate([dataset[i] for i in starts]), policy.model)
 
     read.policy = policy
     return read
@@ -87,7 +87,7 @@ def test_action_is_the_one_that_led_to_each_frame(clip_at):
         np.testing.assert_allclose(clip.action[row, 1:, 0], expected[1:], atol=1e-5)
         np.testing.assert_allclose(clip.action[row, 1:, 1], -expected[1:], atol=1e-5)
         assert (clip.action[row, 0] == 0).all()
-    taken = policy.denormalise_action(clip.action[0])[1:, 0]
+    taken = policy.model.units.denormalise_action(clip.action[0])[1:, 0]
     np.testing.assert_allclose(taken, 100 + np.arange(clip.action.shape[1] - 1), atol=1e-4)
 
 
@@ -101,7 +101,7 @@ def test_images_states_and_labels_belong_to_the_same_frames(clip_at):
     for row, start in enumerate((2, FIRST[1])):
         frames = start + np.arange(8)
         np.testing.assert_allclose(clip.percepts["observation.image"][row, :, 0, 4, 4] * 255, 10 * frames, atol=1e-3)
-        state = clip.state[row] * policy.state_std + policy.state_mean
+        state = clip.state[row] * policy.model.units.state_std + policy.model.units.state_mean
         np.testing.assert_allclose(state[:, 0], frames, atol=1e-4)
         np.testing.assert_array_equal(clip.failure[row], frames % 2)
         np.testing.assert_array_equal(clip.terminal[row], np.isin(frames, FIRST[1:] - 1))
@@ -131,9 +131,9 @@ def test_what_is_not_valid_is_not_learned_from(clip_at, monkeypatch):
 
 def test_actions_and_states_are_scaled_by_the_datasets_range(clip_at):
     config = clip_at.policy.config
-    assert (config.action_low, config.action_high) == ([100.0, 1.0 - N], [100.0 + N - 1, 0.0])
-    assert config.state_mean[0] == pytest.approx((N - 1) / 2)
-    assert (config.fps, config.action_names, config.state_names) == (
+    assert (config.trained_on.action_low, config.trained_on.action_high) == ([100.0, 1.0 - N], [100.0 + N - 1, 0.0])
+    assert config.trained_on.state_mean[0] == pytest.approx((N - 1) / 2)
+    assert (config.trained_on.fps, config.trained_on.action_names, config.trained_on.state_names) == (
         10,
         ["count.vel", "back.vel"],
         ["count.pos", "back.pos"],
@@ -142,9 +142,9 @@ def test_actions_and_states_are_scaled_by_the_datasets_range(clip_at):
 
 def test_missing_camera_names_those_there_are(counting_root):
     meta = tiny.metadata(counting_root, "me/counting")
-    config = tiny.config(cameras=["observation.images.wrist"])
+    config = tiny.config(trained_on_cameras=["observation.images.wrist"])
     with pytest.raises(ValueError, match=r"lacks the camera observation.images.wrist.*observation.image"):
-        ClipReader.of_dataset(config, meta)
+        adopt(config, meta, meta.stats)
 
 
 def test_robot_with_a_single_joint_is_decoded_too(tmp_path):
@@ -157,4 +157,4 @@ def test_robot_with_a_single_joint_is_decoded_too(tmp_path):
 def test_unlabelled_dataset_is_refused_before_training(counting_root):
     meta = tiny.metadata(counting_root, "me/counting")
     with pytest.raises(UnlabelledDatasetError, match="column 'spilled'"):
-        tiny.new_policy(meta, failure_specification="spilled")
+        tiny.new_policy(meta, margin_failure_specification="spilled")

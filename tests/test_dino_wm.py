@@ -268,7 +268,7 @@ def test_filter_is_trained_saved_and_loaded(token_root, tmp_path):
     from lerobot_latentsafe.training import train_margin, train_reachability
 
     meta = tiny.metadata(token_root)
-    options = dict(world_model=tiny.dino_wm_config(), action_candidates=None, margin_clips=32)
+    options = dict(world_model=tiny.dino_wm_config(), fallback_action_candidates=None, margin_clips=32)
     stage_one = tiny.train_stage_one(meta, tmp_path / "one", **options)
     train_margin(stage_one, meta, tmp_path / "two")
     train_reachability(tmp_path / "two", meta, tmp_path / "three")
@@ -282,12 +282,14 @@ def test_filter_is_trained_saved_and_loaded(token_root, tmp_path):
 def test_latents_that_imagination_starts_from_fit_in_memory(token_root, monkeypatch):
     from lerobot_latentsafe import training
 
-    policy = tiny.new_policy(tiny.metadata(token_root), world_model=tiny.dino_wm_config(), action_candidates=None)
+    policy = tiny.new_policy(
+        tiny.metadata(token_root), world_model=tiny.dino_wm_config(), fallback_action_candidates=None
+    )
     length, cut, windows = policy.config.world_model.clip_length, policy.reader.cut, []
-    monkeypatch.setattr(policy.reader, "cut", lambda first, policy: windows.extend(first) or cut(first, policy))
-    latent = sum(t.nbytes for t in policy.world_model.initial(1).values())
+    monkeypatch.setattr(policy.reader, "cut", lambda first, names: windows.extend(first) or cut(first, names))
+    latent = sum(t.nbytes for t in policy.model.world_model.initial(1).values())
     monkeypatch.setattr(training, "STARTS_BYTES", 2 * latent * 3 * length)
-    draw = training.encoded_starts(policy, policy.reader, torch.Generator())
+    draw = training.encoded_starts(policy.model, policy.reader, torch.Generator())
     assert len(windows) == 3 and len(draw(5)["tokens"]) == 5
 
 

@@ -13,8 +13,10 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_latentsafe.datasets import build_cache
 from lerobot_latentsafe.datasets.build_cache import build_frame_cache
-from lerobot_latentsafe.datasets.frame_cache import FrameCache, FrameCacheError, to_model_images
+from lerobot_latentsafe.datasets.frame_cache import FrameCache, FrameCacheError
 from lerobot_latentsafe.encoders.patch_encoders import EncoderError
+from lerobot_latentsafe.encoders.perception import EncoderMismatchError
+from lerobot_latentsafe.encoders.pictures import to_model_images
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +33,7 @@ def test_cache_holds_what_the_world_model_perceives(token_root, dataset):
     policy = tiny.new_policy(tiny.metadata(token_root), world_model=tiny.gru_config())
     index = np.array([0, 5, 41])
     images = torch.stack([dataset[int(i)]["observation.image"] for i in index])
-    seen = policy.world_model.perception({"observation.image": to_model_images(images, tiny.TOKEN_SIZE)})
+    seen = policy.model.world_model.perception({"observation.image": to_model_images(images, tiny.TOKEN_SIZE)})
     cached, _ = FrameCache.open(token_root).frames(index)
     torch.testing.assert_close(cached["tokens"], seen["tokens"], rtol=2e-3, atol=2e-3)
     torch.testing.assert_close(cached["vector"], seen["vector"], rtol=1e-3, atol=1e-3)
@@ -91,7 +93,7 @@ def test_processes_share_the_work(dataset_root, token_root, tmp_path):
 
 
 def test_pictures_are_no_tokens_and_tokens_no_pictures(cache_meta, token_root):
-    with pytest.raises(FrameCacheError, match=r"holds pictures.*--encoder=auto"):
+    with pytest.raises(EncoderMismatchError, match=r"holds pictures.*--encoder=auto"):
         tiny.new_policy(cache_meta, world_model=tiny.gru_config())
     with pytest.raises(FrameCacheError, match="holds the tokens of efficientnet_lite0"):
         tiny.new_policy(tiny.metadata(token_root))
@@ -101,14 +103,14 @@ def test_pictures_are_no_tokens_and_tokens_no_pictures(cache_meta, token_root):
 def test_cache_of_another_encoder_or_basis_is_refused(token_root, name):
     world_model = tiny.gru_config()
     setattr(world_model.perception, name, "another")
-    with pytest.raises((FrameCacheError, EncoderError), match="another"):
+    with pytest.raises((EncoderMismatchError, EncoderError), match="another"):
         tiny.new_policy(tiny.metadata(token_root), world_model=world_model)
 
 
 def test_training_without_a_token_cache_says_what_to_run(dataset_meta, dataset):
     policy = tiny.new_policy(dataset_meta, world_model=tiny.gru_config())
     with pytest.raises(RuntimeError, match="latentsafe cache --encoder=auto"):
-        policy.world_model.perceive({"observation.image": torch.rand(1, 3, 32, 32)})
+        policy.model.world_model.perceive({"observation.image": torch.rand(1, 3, 32, 32)})
 
 
 def test_basis_of_pictures_is_refused(dataset, cache_root, tmp_path):
@@ -127,7 +129,9 @@ def two_cameras(token_root, tmp_path):
 
 def test_tokens_of_more_cameras_than_the_filter_sees_are_refused(two_cameras):
     with pytest.raises(FrameCacheError, match=r"tokens of observation\.image, observation\.side side by side"):
-        tiny.new_policy(tiny.metadata(two_cameras), world_model=tiny.gru_config(), cameras=["observation.image"])
+        tiny.new_policy(
+            tiny.metadata(two_cameras), world_model=tiny.gru_config(), trained_on_cameras=["observation.image"]
+        )
 
 
 def test_basis_of_other_cameras_is_refused(dataset, two_cameras, tmp_path):

@@ -18,6 +18,13 @@ class CheckpointError(ValueError):
     """A checkpoint that is missing, truncated, edited or of another type."""
 
 
+class OldLayoutError(RuntimeError):
+    """A configuration of an earlier version, with the command that migrates it.
+
+    No ValueError: of those draccus, which reads configurations for LeRobot, drops the message.
+    """
+
+
 def committed_names() -> list[str]:
     """Names of the checkpoints that come with the package."""
     return sorted(p.parent.name for p in PRETRAINED.glob(f"*/{CONFIG}"))
@@ -59,9 +66,9 @@ def read_config(folder: Path, device: str | None = None) -> PreTrainedConfig:
     """
     try:
         config = PreTrainedConfig.from_pretrained(folder)
-    except CheckpointError:
-        raise
     except (OSError, ValueError, draccus.utils.DecodingError) as e:
+        if isinstance(e.__cause__, OldLayoutError):
+            raise CheckpointError(f"{folder}: {e.__cause__}") from e
         raise CheckpointError(f"{folder / CONFIG} is missing or not readable ({e})") from e
     if device is not None:
         config.device = device
