@@ -7,11 +7,12 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from lerobot_latentsafe.encoders.patch_encoders import PatchEncoder
+from lerobot_latentsafe.evaluation.rollouts import steps
+from lerobot_latentsafe.experiments.scene_world import OperatorActor, SceneWorld
 from lerobot_latentsafe.franka.bag import VARIANTS
 from lerobot_latentsafe.franka.behaviors import begin
+from lerobot_latentsafe.franka.scene import CAMERAS
 from lerobot_latentsafe.franka.scenes import make_scene
-
-CAMERAS = ("front", "wrist")
 
 
 def see_variants(image_size: int, behavior: str, step: int, seed: int) -> dict[str, np.ndarray]:
@@ -20,11 +21,9 @@ def see_variants(image_size: int, behavior: str, step: int, seed: int) -> dict[s
     for variant in VARIANTS:
         scene = make_scene("bag", variant, image_size)
         scene.reset(seed)
-        actions = begin(behavior, scene, None, np.random.default_rng(seed))
-        action = np.zeros(7)
-        for _ in range(step):
-            action = next(actions, np.append(np.zeros(6), action[6]))
-            scene.step(action)
+        operator = OperatorActor(begin(behavior, scene, None, np.random.default_rng(seed)))
+        for _ in steps(SceneWorld(scene, step, cameras=()), operator):
+            pass
         seen[variant] = np.stack([scene.render(camera) for camera in CAMERAS])
         scene.close()
     return seen

@@ -1,27 +1,24 @@
 """Episodes of the bag, one robot at a time, bare or under a filter, and what became of the candies."""
 
-import hashlib
 import time
-from argparse import ArgumentParser
 from collections.abc import Callable, Hashable
-from dataclasses import asdict, dataclass
-from functools import cache
+from functools import cache, lru_cache
 from itertools import batched
 from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from lerobot_latentsafe.base_policy import BasePolicy
-from lerobot_latentsafe.configuration_latentsafe import DECIDES, LAWS
 from lerobot_latentsafe.decision import FilterDecision
+from lerobot_latentsafe.evaluation.rollouts import Actor, Choice, PolicyActor, steps
 from lerobot_latentsafe.evaluation.statistics import paired_p_value, provenance, run_resumable, wilson
+from lerobot_latentsafe.experiments.filter_settings import FilterSetting
+from lerobot_latentsafe.experiments.scene_world import FRONT, OperatorActor, SceneWorld, picture
 from lerobot_latentsafe.franka.bag import BagScene
 from lerobot_latentsafe.franka.behaviors import Actions
 from lerobot_latentsafe.franka.scene import CAMERAS
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
-from lerobot_latentsafe.runtime.checkpoint import WEIGHTS, read_config, resolve_checkpoint
 
 STEPS = 90
 """Of an operator, who lifts the bag within 6 s."""
@@ -29,150 +26,75 @@ FIRST_SEED = 300_000
 """Settings were chosen on smaller seeds."""
 WARM_UP = 3
 """Decisions of an episode that are not timed."""
-
 N_TRACES = 5
 """Episodes whose values are kept step by step in results and drawn."""
 
 
-@dataclass(frozen=True)
-class FilterSetting:
-    """A filter as an experiment runs it: all that its decisions depend on."""
-
-    path: str
-    law: str
-    epsilon: float
-    guard: int
-    release: float
-    fingerprint: str
-
-    @classmethod
-    def of(cls, path: str, law: str, **changed: float | None) -> "FilterSetting":
-        """Epsilon, guard and release are the filter's own unless given."""
-        own = read_config(resolve_checkpoint(path))
-        chosen = {name: getattr(own, name) if changed.get(name) is None else changed[name] for name in DECIDES}
-        return cls(path, law, **chosen, fingerprint=fingerprint(path))
-
-    @classmethod
-    def all(cls, paths: list[str], laws: list[str], options: object) -> list["FilterSetting"]:
-        """Filters under the first law, and the first of them under the others, which are what it is compared with.
-
-        Epsilon, guard and release are those of a command line's options.
-        """
-        pairs = [(path, laws[0]) for path in paths] + [(paths[0], law) for law in laws[1:]]
-        changed = {name: getattr(options, name) for name in DECIDES}
-        return [cls.of(path, law, **changed) for path, law in pairs]
-
-    def load(self, base: str | None = None) -> LatentSafePolicy:
-        """The filter, with the policy it is to shield, if any."""
-        policy = LatentSafePolicy.from_pretrained(self.path).eval()
-        policy.config.override(self, "law", *DECIDES)
-        if base is not None:
-            policy.attach(base)
-        return policy
-
-
-def add_filter_options(parser: ArgumentParser, n: int) -> None:
-    """The filters of an experiment, how they decide, and how many starts: by default n."""
-    parser.add_argument("--filters", nargs="+", required=True)
-    parser.add_argument("--n", type=int, default=n)
-    parser.add_argument("--epsilon", type=float)
-    parser.add_argument("--guard", type=int)
-    parser.add_argument("--release", type=float)
-    parser.add_argument("--workers", type=int, default=1, help="processes")
-
-
-def add_laws(parser: ArgumentParser) -> None:
-    """The laws that are compared, see `FilterSetting.all`."""
-    parser.add_argument(
-        "--laws", nargs="+", choices=LAWS, default=["reachability", "plan", "margin"],
-        help="the first for all filters, the others for the first filter",
-    )  # fmt: skip
-
-
-def in_use(settings: list[FilterSetting]) -> dict[str, dict]:
-    """Path -> what a table notes of a filter beside its rates."""
-    rows = {setting.path: {name: getattr(setting, name) for name in DECIDES} for setting in settings}
-    for path, row in rows.items():
-        own = read_config(resolve_checkpoint(path))
-        row |= {"memory": own.memory} if own.memory else {}
-        if own.retreat:
-            row |= {"retreat": own.retreat, "patience": own.patience, "dwell": own.dwell}
-    return rows
-
-
-def as_job(setting: FilterSetting | None) -> dict | None:
-    """As a part of a job; back by `FilterSetting(**...)`."""
-    return asdict(setting) if setting else None
-
-
 @cache
-def fingerprint(path: str) -> str:
-    """Hash of a checkpoint's weights and configuration."""
-    files = [resolve_checkpoint(path) / name for name in ("config.json", WEIGHTS)]
-    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
+def bag_scene(variant: str = "red") -> BagScene:
+    """The bag of this process."""
+    return BagScene(variant)
 
 
-def observe(scene: BagScene) -> dict[str, Tensor]:
-    """What the robot would send, as a LeRobot batch of one."""
-    images = {
-        f"observation.images.{name}": torch.from_numpy(scene.render(name)).permute(2, 0, 1)[None] / 255.0
-        for name in CAMERAS
-    }
-    return {**images, "observation.state": torch.from_numpy(scene.proprioception())[None]}
+@lru_cache(maxsize=2)
+def load(setting: FilterSetting | None, base: str | None = None) -> BasePolicy | LatentSafePolicy | None:
+    """A policy bare or under a filter, a filter without a policy, or nothing."""
+    torch.set_num_threads(1)
+    if setting is None:
+        return None if base is None else BasePolicy.load(base)
+    return setting.load(base)
+
+
+class TimedActor:
+    """An actor whose choices are timed.
+
+    Attributes:
+        cost: CPU seconds of each.
+    """
+
+    def __init__(self, actor: Actor):
+        self.actor, self.cost = actor, []
+
+    def __call__(self, seen: dict) -> Choice:
+        began = time.process_time()
+        choice = self.actor(seen)
+        self.cost.append(time.process_time() - began)
+        return choice
 
 
 def drive(
-    scene: BagScene, actor: BasePolicy | LatentSafePolicy | None, operator: Actions | None = None,
-    frames: list[np.ndarray] | None = None, steps: int | None = None,
+    scene: BagScene, policy: BasePolicy | LatentSafePolicy | None, operator: Actions | None = None,
+    frames: list[np.ndarray] | None = None, n_steps: int | None = None,
 ) -> dict:  # fmt: skip
     """One episode of a scene that has just been reset.
 
     Args:
-        actor: a bare policy; a filter, with a base policy or over an operator; None: the operator alone.
+        policy: a bare policy; a filter, with a base policy or over an operator; None: the operator alone.
         operator: what an operator does, who goes on trying where the filter overrides; None: a policy acts.
         frames: the front camera's pictures of all steps are appended, if given.
-        steps: how long it lasts; by default an operator's.
+        n_steps: how long it lasts; by default an operator's.
 
     Returns:
         lost: candies outside at the end; success; grasped: whether the bag was ever held; overridden: steps; first:
         step of the first override or None; cost: CPU seconds of each decision; and step by step: value, margin,
         intervened, spilled (candies outside).
     """
-    action, decisions, cost, truths = np.zeros(7), [], [], []
-    if actor is not None:
-        actor.reset()
-    for _ in range(steps or STEPS):
+    actor = TimedActor(PolicyActor(policy) if operator is None else OperatorActor(operator, policy))
+    world = SceneWorld(scene, n_steps or STEPS, () if policy is None and frames is None else CAMERAS)
+    decisions, truths = [], []
+    for step in steps(world, actor):
+        decisions += [] if step.decision is None else [step.decision]
+        truths.append(step.info)
         if frames is not None:
-            frames.append(scene.render("front"))
-        if operator is not None:
-            action = next(operator, np.append(np.zeros(6), action[6]))
-        executed = action
-        if actor is not None:
-            seen, began = observe(scene), time.process_time()
-            acted, decision = _act(actor, seen, None if operator is None else torch.from_numpy(action).float()[None])
-            cost.append(time.process_time() - began)
-            decisions += [] if decision is None else [decision]
-            executed = acted[0].double().numpy()
-        scene.step(executed)
-        truths.append(scene.truth())
+            frames.append(picture(step.seen[FRONT]))
     return {
         "lost": truths[-1]["spilled"],
         "success": truths[-1]["is_success"],
         "grasped": any(truth["grasp"] >= 0 for truth in truths),
-        "cost": cost,
+        "cost": [] if policy is None else actor.cost,
         "spilled": [truth["spilled"] for truth in truths],
         **_overrides(decisions),
     }
-
-
-@torch.no_grad()
-def _act(
-    actor: BasePolicy | LatentSafePolicy, seen: dict[str, Tensor], proposed: Tensor | None
-) -> tuple[Tensor, FilterDecision | None]:
-    if isinstance(actor, BasePolicy):
-        return actor.propose(seen), None
-    decision = actor.decide(seen) if proposed is None else actor.shield(seen, proposed)
-    return decision.action, decision
 
 
 def _overrides(decisions: list[FilterDecision]) -> dict:

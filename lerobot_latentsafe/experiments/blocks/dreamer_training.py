@@ -7,7 +7,7 @@ so a run that was killed goes on from its last checkpoint as if nothing had happ
 import json
 import shutil
 import time
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import draccus
@@ -20,15 +20,15 @@ from torch import Tensor
 
 from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
 from lerobot_latentsafe.datasets.clips import Clip
+from lerobot_latentsafe.experiments.blocks.cuda_graph import Replayed
 from lerobot_latentsafe.experiments.blocks.recorders import Recorders, number
 from lerobot_latentsafe.experiments.blocks.replay import CAMERA_KEYS, Replay, described, export
 from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES
-from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.policies.dreamer.configuration_dreamer import LatentSafeDreamerConfig
 from lerobot_latentsafe.policies.dreamer.modeling_dreamer import LatentSafeDreamerPolicy
-from lerobot_latentsafe.runtime.checkpoint import save_filter
-from lerobot_latentsafe.runtime.cuda_graph import Replayed
+from lerobot_latentsafe.runtime.hub import save_policy
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
+from lerobot_latentsafe.safety_model import SafetyModel
 from lerobot_latentsafe.units import adopt_dataset
 
 OPTIONS, LOG = "options.json", "log.jsonl"
@@ -127,7 +127,7 @@ class DreamerTraining:
                 self._save()
         self.policy.eval()
         if not (self.folder / "policy").exists():
-            save_filter(self.policy, self.folder / "policy.unfinished")
+            save_policy(self.policy, self.folder / "policy.unfinished")
             (self.folder / "policy.unfinished").rename(self.folder / "policy")
         if not (self.folder / "episodes").exists():
             export(self.replay, len(self.replay.written), self.folder / "episodes", options.repo_id, self.scene)
@@ -222,7 +222,8 @@ class DreamerTraining:
         options, policy = self.options, self.policy
         config, device = policy.config.behavior, policy.model.device
         rng = np.random.default_rng([options.seed, self.step])
-        reader = self.replay.reader(self.n_episodes, policy.model.config.world_model.clip_length)
+        model = policy.model
+        reader = self.replay.reader(self.n_episodes, model.config.world_model.clip_length, model.units)
         n_frames, n_demonstrated = len(reader.labels.failure), options.demonstrations * self.replay.length
         # A few episodes of the policy would be learned by heart if they made up most of a batch.
         share = max(options.demonstration_share, n_demonstrated / n_frames)
@@ -233,12 +234,12 @@ class DreamerTraining:
             rng.integers(n_demonstrated, size=options.batch_size),
             rng.integers(min(n_demonstrated, n_frames - 1), n_frames, size=options.batch_size),
         )
-        clip = reader.cut(first, policy.model)
+        clip = reader.cut(first, model.world_model.percept_names)
         ahead = first[:, None] + np.arange(reader.length)
         window = np.minimum(ahead, n_frames - 1)
         reward = config.rewards.reward(torch.from_numpy(self.replay.arrays["terms"][window]))
         meant = torch.from_numpy(self.replay.arrays["meant"][window]).to(device)
-        meant = policy.model.normalise_action(meant).clamp(-1, 1)
+        meant = model.units.normalise_action(meant).clamp(-1, 1)
         same = reader.labels.episode[window] == reader.labels.episode[first][:, None]
         valid = np.flatnonzero(same & (ahead == window))
         # At first the critic only learns what imitation is worth.
@@ -257,16 +258,17 @@ class DreamerTraining:
         """Fresh weights, for what the demonstrations hold."""
         options = self.options
         torch.manual_seed(number(options.seed, 0, 0))
-        config = options.model
-        config.cameras, config.task = list(CAMERA_KEYS), self.scene.task
-        shape = (3, self.scene.image_size, self.scene.image_size)
-        config.input_features = {
-            **{key: PolicyFeature(FeatureType.VISUAL, shape) for key in CAMERA_KEYS},
-            "observation.state": PolicyFeature(FeatureType.STATE, (len(STATE_NAMES),)),
-        }
-        config.output_features = {"action": PolicyFeature(FeatureType.ACTION, (len(ACTION_NAMES),))}
-        adopt_dataset(config, described(self.scene.fps), self.replay.statistics(options.demonstrations))
-        self._train(LatentSafeDreamerPolicy(options.policy, LatentSafePolicy(config)), 0)
+        config, shape = options.model, (3, self.scene.image_size, self.scene.image_size)
+        known = replace(config.trained_on, cameras=list(CAMERA_KEYS), task=self.scene.task)
+        config.change(
+            input_features={
+                **{key: PolicyFeature(FeatureType.VISUAL, shape) for key in CAMERA_KEYS},
+                "observation.state": PolicyFeature(FeatureType.STATE, (len(STATE_NAMES),)),
+            },
+            output_features={"action": PolicyFeature(FeatureType.ACTION, (len(ACTION_NAMES),))},
+            trained_on=adopt_dataset(known, described(self.scene.fps), self.replay.statistics(options.demonstrations)),
+        )
+        self._train(LatentSafeDreamerPolicy(options.policy, SafetyModel(config).to(config.device)), 0)
 
     def _train(self, policy: LatentSafeDreamerPolicy, step: int) -> None:
         self.policy, self.step = policy.train(), step
@@ -274,9 +276,10 @@ class DreamerTraining:
         if self.options.cuda_graph and policy.model.device.type == "cuda":
             changed = [*policy.buffers(), *policy.model.buffers()]
             self.backpropagate = Replayed(self._backpropagate, changed)
-        config = policy.config.behavior
+        config, model = policy.config.behavior, policy.model
+        learned = [*model.world_model.parameters(), *model.margin.parameters(), *policy.reward.parameters()]
         parts = {
-            "model": [([*policy.model.get_optim_params(), *policy.reward.parameters()], config.model_lr)],
+            "model": [(learned, config.model_lr)],
             "behavior": [(policy.actor.parameters(), config.actor_lr), (policy.critic.parameters(), config.critic_lr)],
         }
         self.step_sizes = {name: [lr for _, lr in groups] for name, groups in parts.items()}
@@ -294,7 +297,7 @@ class DreamerTraining:
         before = self._checkpoints()
         partial = self.folder / "checkpoints" / "unfinished"
         shutil.rmtree(partial, ignore_errors=True)
-        save_filter(self.policy, partial / "policy")
+        save_policy(self.policy, partial / "policy")
         save_optimizer_state(self.optimizers, partial / "optimizers")
         partial.rename(self.folder / "checkpoints" / f"{self.step:07d}")
         for folder in before:

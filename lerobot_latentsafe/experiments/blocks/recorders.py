@@ -50,9 +50,8 @@ class Recorder:
 
     def _policy(self, folder: Path) -> LatentSafeDreamerPolicy:
         if folder != self.folder:
-            config = read_config(folder)
-            config.device = "cpu"
-            self.policy, self.folder = LatentSafeDreamerPolicy.from_pretrained(folder, config=config).eval(), folder
+            policy = LatentSafeDreamerPolicy.from_pretrained(folder, config=read_config(folder, "cpu"))
+            self.policy, self.folder = policy.eval(), folder
         return self.policy
 
 
@@ -104,7 +103,7 @@ class _Straying:
 
 
 class _Scripted:
-    """An operator of `teleoperators/scripted`, whose hand does not always do what it means.
+    """A scripted operator, whose hand does not always do what it means.
 
     While its fingers are open it is jostled; at any time it may be led astray. So a learner sees how to come back. When
     the operator has finished it holds still.
@@ -148,7 +147,7 @@ class _Exploring:
             if self.straying.move is not None:
                 moved = self.policy.executed.clone()
                 moved[:, :3] = torch.from_numpy(self.straying.move).to(moved)
-                action = self.policy.model.denormalise_action(moved)
+                action = self.policy.model.units.denormalise_action(moved)
                 self.policy.was_overridden(action)
         return action.cpu().numpy()
 

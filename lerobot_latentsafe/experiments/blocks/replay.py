@@ -9,16 +9,22 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-from lerobot.envs import preprocess_observation
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from lerobot_latentsafe.datasets.build_cache import write_manifest
 from lerobot_latentsafe.datasets.clips import ClipReader
-from lerobot_latentsafe.datasets.frame_cache import FOLDER, FrameCache, to_model_images
+from lerobot_latentsafe.datasets.frame_cache import FOLDER, FrameCache
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE, FailureLabels
+from lerobot_latentsafe.encoders.pictures import to_model_images
 from lerobot_latentsafe.envs.franka_env import FrankaEnv
+from lerobot_latentsafe.evaluation.rollouts import Choice, steps
+from lerobot_latentsafe.experiments.blocks.worlds import EnvironmentsWorld
 from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES, action_limits
 from lerobot_latentsafe.franka.scene import FrankaScene
 from lerobot_latentsafe.policies.dreamer.behavior import TERMS
 from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
+from lerobot_latentsafe.runtime.files import refuse_existing
+from lerobot_latentsafe.units import Units
 
 CAMERA_KEYS = ("observation.images.front", "observation.images.wrist")
 Operator = Callable[[dict[str, torch.Tensor]], np.ndarray]
@@ -32,33 +38,24 @@ def record(envs: list[FrankaEnv], seeds: list[int], operator: Operator, image_si
     Frame t holds o_t, the action taken after it, the one that was meant, whether the episode has failed by then, and
     the reward's terms of arriving there.
     """
-    observations, infos = zip(*[env.reset(seed=seed)[:2] for env, seed in zip(envs, seeds)])
     low, high = action_limits(envs[0].metadata["render_fps"])
     previous = [None, None]  # the last two actions (N, 7), in [-1, 1]
     rows: list[dict[str, np.ndarray]] = []
-    for _ in range(envs[0]._max_episode_steps):
-        batch = preprocess_observation(_stacked(observations))
-        action = np.asarray(operator(batch), np.float32)
+    for step in steps(EnvironmentsWorld(envs, seeds), lambda batch: Choice(np.asarray(operator(batch), np.float32))):
         change = np.zeros(len(envs)) if previous[0] is None else np.square(previous[1] - previous[0]).sum(1)
-        terms = [[*(float(info[name]) for name in TERMS[:-1]), rate] for info, rate in zip(infos, change)]
+        terms = [[*(float(info[name]) for name in TERMS[:-1]), rate] for info, rate in zip(step.before, change)]
         rows.append(
             {
-                **{key: _small(batch[key], image_size) for key in CAMERA_KEYS},
-                "state": batch["observation.state"].numpy(),
-                "action": action,
-                "meant": getattr(operator, "meant", action),
-                "failure": np.array([FAILING if info["failure"] else SAFE for info in infos], np.int8),
+                **{key: _small(step.seen[key], image_size) for key in CAMERA_KEYS},
+                "state": step.seen["observation.state"].numpy(),
+                "action": step.action,
+                "meant": getattr(operator, "meant", step.action),
+                "failure": np.array([FAILING if info["failure"] else SAFE for info in step.before], np.int8),
                 "terms": np.array(terms, np.float32),
             }
         )
-        previous = [previous[1], 2 * (action - low) / (high - low) - 1]
-        observations, _, _, _, infos = zip(*[env.step(a) for env, a in zip(envs, action)])
+        previous = [previous[1], 2 * (step.action - low) / (high - low) - 1]
     return [{name: np.stack([row[name][i] for row in rows]) for name in rows[0]} for i in range(len(envs))]
-
-
-def _stacked(observations: tuple[dict, ...]) -> dict:
-    pixels = {name: np.stack([o["pixels"][name] for o in observations]) for name in observations[0]["pixels"]}
-    return {"pixels": pixels, "agent_pos": np.stack([o["agent_pos"] for o in observations])}
 
 
 def _small(images: torch.Tensor, image_size: int) -> np.ndarray:
@@ -122,14 +119,14 @@ class Replay:
             pictures[frames] = torch.from_numpy(episode[key]).to(pictures.device)
         self.written[i] = True
 
-    def reader(self, n_episodes: int, clip_length: int) -> ClipReader:
-        """Clips of the first so many episodes."""
+    def reader(self, n_episodes: int, clip_length: int, units: Units) -> ClipReader:
+        """Clips of the first so many episodes, in these units."""
         n = n_episodes * self.length
         labels = FailureLabels(
             self.arrays["failure"][:n], np.zeros(n, np.int8), np.repeat(np.arange(n_episodes), self.length)
         )
         cache = FrameCache(self.percepts, {}, self.arrays["state"], self.arrays["action"], {})
-        return ClipReader(labels, cache, clip_length)
+        return ClipReader(labels, cache, clip_length, units)
 
     def statistics(self, n_episodes: int) -> dict[str, dict[str, np.ndarray]]:
         """What LeRobot's dataset statistics say of the first so many episodes' actions and states."""
@@ -157,17 +154,25 @@ def export(replay: Replay, n_episodes: int, root: Path, repo_id: str, scene: Fra
     Raises:
         FileExistsError: root exists.
     """
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    from lerobot_latentsafe.datasets.build_cache import write_manifest
-
-    if root.exists():
-        raise FileExistsError(f"{root} exists; choose another --output_dir or delete it")
+    refuse_existing(root)
     begun = root.with_name(f"{root.name}.begun")
     shutil.rmtree(begun, ignore_errors=True)
+    _write_dataset(replay, n_episodes, begun, repo_id, scene)
+    folder = begun / FOLDER
+    folder.mkdir()
+    for name in (*CAMERA_KEYS, "state", "action"):
+        np.save(folder / f"{name}.npy", replay.arrays[name][: n_episodes * replay.length])
+    seen = {key: [scene.image_size, scene.image_size, 3] for key in CAMERA_KEYS}
+    kept = {"image_size": replay.arrays[CAMERA_KEYS[0]].shape[-1], "percepts": list(CAMERA_KEYS)}
+    write_manifest(begun, LeRobotDatasetMetadata(repo_id, root=begun), seen, kept)
+    begun.rename(root)
+
+
+def _write_dataset(replay: Replay, n_episodes: int, root: Path, repo_id: str, scene: FrankaScene) -> None:
+    """All but the pictures."""
     columns = described(scene.fps)
     dataset = LeRobotDataset.create(
-        repo_id, scene.fps, columns.features, root=begun, robot_type=columns.robot_type, use_videos=False,
+        repo_id, scene.fps, columns.features, root=root, robot_type=columns.robot_type, use_videos=False,
         metadata_buffer_size=100,
     )  # fmt: skip
     for t in range(n_episodes * replay.length):
@@ -184,11 +189,3 @@ def export(replay: Replay, n_episodes: int, root: Path, repo_id: str, scene: Fra
         if (t + 1) % replay.length == 0:
             dataset.save_episode()
     dataset.finalize()
-    folder = begun / FOLDER
-    folder.mkdir()
-    for name in (*CAMERA_KEYS, "state", "action"):
-        np.save(folder / f"{name}.npy", replay.arrays[name][: n_episodes * replay.length])
-    seen = {key: [scene.image_size, scene.image_size, 3] for key in CAMERA_KEYS}
-    kept = {"image_size": replay.arrays[CAMERA_KEYS[0]].shape[-1], "percepts": list(CAMERA_KEYS)}
-    write_manifest(begun, LeRobotDatasetMetadata(repo_id, root=begun), seen, kept)
-    begun.rename(root)

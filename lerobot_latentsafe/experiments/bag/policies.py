@@ -1,0 +1,72 @@
+"""A weak and a strong diffusion policy lift the bag, bare and under the same filters, from the same starts."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from lerobot_latentsafe.evaluation.statistics import write_json
+from lerobot_latentsafe.experiments.bag.runs import FIRST_SEED, bag_scene, drive, in_short, load, run_cells, tabulate
+from lerobot_latentsafe.experiments.filter_settings import FilterSetting, as_job, fingerprint, in_use
+from lerobot_latentsafe.reports.figures import save, severity, write_side_by_side
+
+STEPS = 150
+"""Policies take their time: one that learned to correct itself grasps after 4 to 9 s."""
+
+
+def as_policy_job(base: str, setting: FilterSetting | None) -> dict:
+    """All that a run depends on but its seed."""
+    return {"steps": STEPS, "base": base, "base_fingerprint": fingerprint(base), "filter": as_job(setting)}
+
+
+def run(job: dict, frames: list[np.ndarray] | None = None) -> dict:
+    """One episode, see `drive`."""
+    policy, scene = load(FilterSetting.from_job(job["filter"]), job["base"]), bag_scene()
+    scene.reset(job["seed"])
+    torch.manual_seed(job["seed"])  # a diffusion policy samples
+    return drive(scene, policy, frames=frames, n_steps=STEPS)
+
+
+def film(name: str, bare: dict, shielded: dict, folder: Path) -> Path:
+    """Two runs side by side, driven once more."""
+    columns = {}
+    for column, job in (("bare", bare), ("shielded", shielded)):
+        frames: list[np.ndarray] = []
+        columns[column] = (frames, run(job, frames)["intervened"])
+    return write_side_by_side(columns, folder / f"{name}_{bare['seed']}.mp4", bag_scene().fps)
+
+
+def draw(table: dict[str, dict], law: str, path: Path) -> None:
+    """How many runs spill at least p%, bare and under the filters of a law together."""
+    lost = {}
+    for who, cells in table.items():
+        lost |= {who: cells["bare"]["lost"], f"{who}, shielded": cells[law]["pooled"]["lost"]}
+    save(severity(lost, bag_scene().n_candies), path)
+
+
+def compare_policies(
+    bases: dict[str, str], settings: list[FilterSetting], n: int, output: Path, workers: int = 1, n_videos: int = 0
+) -> None:
+    """Run each policy bare and under each filter, and write the table, a picture beside it, and videos.
+
+    Args:
+        bases: `weak` or `strong` -> path of the policy.
+        settings: the first one, and its law, are drawn and filmed.
+        n: starts.
+        output: of the table, .json.
+        n_videos: starts to film.
+    """
+    cells = {(who, setting): as_policy_job(bases[who], setting) for who in bases for setting in (None, *settings)}
+    runs, made_by = run_cells(output, cells, n, run, workers)
+    n_candies = bag_scene().n_candies
+    table = {who: tabulate(runs[who, None], {s: runs[who, s] for s in settings}, n_candies) for who in bases}
+    for who, laws in table.items():
+        print(f"{who}, bare: {in_short(laws['bare'])}")
+        for setting in settings:
+            print(f"{who}, {setting.law} of {setting.path}: {in_short(laws[setting.law][setting.path])}")
+    draw(table, settings[0].law, output.with_suffix(".png"))
+    write_json(output, {**table, "filters": in_use(settings), **made_by})
+    for who in bases:
+        for seed in range(FIRST_SEED, FIRST_SEED + n_videos):
+            bare, shielded = ({**cells[who, setting], "seed": seed} for setting in (None, settings[0]))
+            print(film(who, bare, shielded, output.parent / "videos"))

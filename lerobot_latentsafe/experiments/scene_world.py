@@ -1,0 +1,71 @@
+"""Scenes of the simulated Franka as worlds, and scripted operators as actors, for whoever drives episodes of them."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lerobot_latentsafe.evaluation.rollouts import Choice
+from lerobot_latentsafe.franka.behaviors import Actions
+from lerobot_latentsafe.franka.scene import CAMERAS, FrankaScene
+from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+
+FRONT = "observation.images.front"
+
+
+class SceneWorld:
+    """One episode of a scene that has just been reset; `info` is the scene's truth.
+
+    Args:
+        n_steps: how long it lasts.
+        cameras: those that somebody looks through; drawing takes most of the time.
+    """
+
+    def __init__(self, scene: FrankaScene, n_steps: int, cameras: Sequence[str] = CAMERAS):
+        self.scene, self.left, self.cameras = scene, n_steps, cameras
+        self.info = scene.truth()
+
+    @property
+    def over(self) -> np.ndarray:
+        """Whether the time is up: bool (1,)."""
+        return np.array([self.left <= 0])
+
+    def observe(self) -> dict[str, Tensor]:
+        """What the robot would send, as a LeRobot batch of one."""
+        images = {
+            f"observation.images.{name}": torch.from_numpy(self.scene.render(name)).permute(2, 0, 1)[None] / 255.0
+            for name in self.cameras
+        }
+        return {**images, "observation.state": torch.from_numpy(self.scene.proprioception())[None]}
+
+    def step(self, action: np.ndarray) -> None:
+        """Act (1, 7) in robot units."""
+        self.scene.step(np.asarray(action[0], float))
+        self.info, self.left = self.scene.truth(), self.left - 1
+
+
+def picture(images: Tensor) -> np.ndarray:
+    """The first picture of a LeRobot batch (B, 3, H, W) in [0, 1], as uint8 (H, W, 3)."""
+    return (images[0].permute(1, 2, 0) * 255).round().to(torch.uint8).numpy()
+
+
+class OperatorActor:
+    """A scripted operator, who goes on trying where a filter overrides.
+
+    Args:
+        operator: what it does.
+        filter: what it is shielded by; None: nothing.
+    """
+
+    def __init__(self, operator: Actions, filter: LatentSafePolicy | None = None):
+        self.operator, self.filter, self.action = operator, filter, np.zeros(7)
+        if filter is not None:
+            filter.reset()
+
+    def __call__(self, batch: dict[str, Tensor]) -> Choice:
+        self.action = next(self.operator, np.append(np.zeros(6), self.action[6]))
+        if self.filter is None:
+            return Choice(self.action[None])
+        decision = self.filter.shield(batch, torch.from_numpy(self.action).float()[None])
+        return Choice(decision.action.cpu().numpy(), decision)
