@@ -1,10 +1,14 @@
 """Latent safety filters for LeRobot.
 
-Importing this package registers the policy, environments, robots, teleoperators and world models with LeRobot's
-registries, and loads nothing heavy: models and simulators are imported when they are used.
+Importing this package registers the policies, environments, robots, teleoperators, processors and world models with
+LeRobot's registries, and loads nothing heavy. What a notebook needs is imported when it is asked for; see `api.py`.
 """
 
+import importlib
+from typing import TYPE_CHECKING, Any
+
 from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
+from lerobot_latentsafe.decision import LawOptions
 from lerobot_latentsafe.envs.configuration_envs import LatentSafeBagEnv, LatentSafeBlocksEnv, LatentSafeDubinsEnv
 from lerobot_latentsafe.policies.dreamer.configuration_dreamer import LatentSafeDreamerConfig
 from lerobot_latentsafe.policies.grasp_prediction import GraspPredictionStep
@@ -14,7 +18,22 @@ from lerobot_latentsafe.robots.shielded.config_shielded import LatentSafeShielde
 from lerobot_latentsafe.teleoperators.end_effector.config_end_effector import LatentSafeEndEffectorConfig
 from lerobot_latentsafe.teleoperators.scripted.config_scripted import LatentSafeScriptedConfig
 
+if TYPE_CHECKING:
+    from lerobot_latentsafe.api import (
+        EpisodeValues,
+        FilterDecision,
+        LatentSafePolicy,
+        decide,
+        evaluate_filter,
+        load_filter,
+        shield_policy,
+        train_filter,
+        values_along,
+    )
+
 __all__ = [
+    "EpisodeValues",
+    "FilterDecision",
     "GraspPredictionStep",
     "LatentSafeBagEnv",
     "LatentSafeBlocksEnv",
@@ -24,7 +43,22 @@ __all__ = [
     "LatentSafeEndEffectorConfig",
     "LatentSafeFrankaConfig",
     "LatentSafeFrankaMujocoConfig",
+    "LatentSafePolicy",
     "LatentSafeScriptedConfig",
     "LatentSafeShieldedConfig",
+    "LawOptions",
+    "decide",
+    "evaluate_filter",
+    "load_filter",
+    "shield_policy",
+    "train_filter",
+    "values_along",
 ]
-__version__ = "0.1.0"
+__version__ = "0.2.0"
+
+
+def __getattr__(name: str) -> Any:
+    """What `api.py` offers, imported at first use."""
+    if name not in __all__:
+        raise AttributeError(f"module 'lerobot_latentsafe' has no attribute {name!r}; it has {', '.join(__all__)}")
+    return getattr(importlib.import_module("lerobot_latentsafe.api"), name)

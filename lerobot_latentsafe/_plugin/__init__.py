@@ -1,3 +1,3 @@
 """Installed as `lerobot_policy_latentsafe`, the module name LeRobot imports for this distribution."""
 
-from lerobot_latentsafe import *  # noqa: F403
+import lerobot_latentsafe  # noqa: F401  (registers everything)
