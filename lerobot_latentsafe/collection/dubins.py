@@ -3,15 +3,15 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from tqdm import tqdm
 
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE
 from lerobot_latentsafe.dubins import car
-
-if TYPE_CHECKING:
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot_latentsafe.dubins.ground_truth import sample_task_start
+from lerobot_latentsafe.runtime.files import refuse_existing
 
 FEATURES = {
     "observation.image": {"dtype": "image", "shape": (128, 128, 3), "names": ["height", "width", "channels"]},
@@ -106,7 +106,7 @@ def goal_episodes(
         def act(state: np.ndarray, t: int, jitter: np.ndarray = jitter, limit: float = limit) -> float:
             return float(np.clip(driver(state) + jitter[t], -limit, limit))
 
-        yield _drive(car.sample_task_start(rng), act, max_steps, _arrived)
+        yield _drive(sample_task_start(rng), act, max_steps, _arrived)
 
 
 def _drive(
@@ -137,7 +137,7 @@ SOURCES: dict[str, Callable[[int, np.random.Generator], Iterator[Episode]]] = {
 WITH_POSITION = ("careful", "reckless")
 
 
-def collect_dubins(source: str, repo_id: str, root: str | Path, n_episodes: int | None, seed: int) -> "LeRobotDataset":
+def collect_dubins(source: str, repo_id: str, root: str | Path, n_episodes: int | None, seed: int) -> LeRobotDataset:
     """Record episodes of the car as a LeRobotDataset; None records the paper's 2,000.
 
     Demonstrations also store the car's position as observation.environment_state, which lets a diffusion policy
@@ -147,13 +147,9 @@ def collect_dubins(source: str, repo_id: str, root: str | Path, n_episodes: int 
         ValueError: unknown source.
         FileExistsError: root exists.
     """
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-    from tqdm import tqdm
-
     if source not in SOURCES:
         raise ValueError(f"--source is {source!r}; expected one of {', '.join(SOURCES)}")
-    if Path(root).exists():
-        raise FileExistsError(f"{root} exists; choose another --root or delete it")
+    refuse_existing(root, "--dataset.root")
     n_episodes = n_episodes or 2000
     features = {**FEATURES, **(POSITION if source in WITH_POSITION else {})}
     dataset = LeRobotDataset.create(

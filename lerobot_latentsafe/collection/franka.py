@@ -12,20 +12,25 @@ from dataclasses import dataclass
 from functools import cache, partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from lerobot.configs.video import RGBEncoderConfig
+from lerobot.datasets.aggregate import aggregate_datasets
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from tqdm import tqdm
 
-from lerobot_latentsafe.collection.interventions import BRIEF, RETREATING, Hand, Interruptions
+from lerobot_latentsafe.collection.interventions import BRIEF, RETREATING, Interventions, InterventionStyle
+from lerobot_latentsafe.collection.policy_operator import PolicyOperator
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE
+from lerobot_latentsafe.evaluation.rollouts import Choice, steps
 from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES, action_limits, read_action
+from lerobot_latentsafe.franka.behaviors import GRASPED, grasp, stray
 from lerobot_latentsafe.franka.scenes import CLUMSINESS, HELD_ANYWHERE, SCENES
-
-if TYPE_CHECKING:
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    from lerobot_latentsafe.collection.policy_operator import PolicyOperator
-    from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
+from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
+from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
+from lerobot_latentsafe.runtime.files import refuse_existing
+from lerobot_latentsafe.teleoperators.scripted.config_scripted import LatentSafeScriptedConfig
+from lerobot_latentsafe.teleoperators.scripted.scripted import LatentSafeScripted
 
 EPISODES_A_PART = 50
 HIGH = 0.10
@@ -37,7 +42,7 @@ class Source:
     """A dataset: its scene, how many episodes, and who moves the robot in each.
 
     Attributes:
-        mix: behaviours of `teleoperators/scripted` with the number of episodes of each, in a dataset of full size;
+        mix: behaviours of `franka/behaviors.py` with the number of episodes of each, in a dataset of full size;
             smaller ones keep the proportions. Episodes of different behaviours are interleaved.
         branches: episodes that start from each grasped state; 0 records whole episodes from the start.
         grasps: of those states, the shares in which the bag is held by each of its segments, from its closed end on.
@@ -48,7 +53,7 @@ class Source:
             are closed, while the operator keeps them open. Recorded is what the operator commands, so that a policy
             learns to correct and not to stray (DART, Laskey et al. 2017).
         policies: the behaviours are names of policies, see `policy_operator.py`.
-        hand: how policies and operators are interrupted, if at all.
+        style: how somebody intervenes in what policies and operators do, if at all.
         shield: name of the filter that says when, instead of chance.
         seconds: how long an episode lasts; None: as long as the scene's.
     """
@@ -62,7 +67,7 @@ class Source:
     astray: float = 0.0
     pushed: float = 0.0
     policies: bool = False
-    hand: Hand | None = None
+    style: InterventionStyle | None = None
     shield: str | None = None
     seconds: float | None = None
 
@@ -90,10 +95,10 @@ SOURCES: dict[str, Source] = {
     ),
     "bag_clumsy": Source("bag", {"clumsy": 120}),
     # The weak one spills, of which there is more to learn; of the strong one, what is stopped without need.
-    "bag_policies": Source("bag", {WEAK: 150, STRONG: 50}, policies=True, hand=BRIEF, seconds=10.0),
-    "bag_shielded": Source("bag", {WEAK: 50, STRONG: 150}, policies=True, hand=RETREATING, shield="bag", seconds=10.0),
+    "bag_policies": Source("bag", {WEAK: 150, STRONG: 50}, policies=True, style=BRIEF, seconds=10.0),
+    "bag_shielded": Source("bag", {WEAK: 50, STRONG: 150}, policies=True, style=RETREATING, shield="bag", seconds=10.0),
     "bag_retreats": Source(
-        "bag", {"open_end": 80, "middle": 30, "closed_end": 90}, astray=0.3, hand=RETREATING, seconds=8.0
+        "bag", {"open_end": 80, "middle": 30, "closed_end": 90}, astray=0.3, style=RETREATING, seconds=8.0
     ),
     "bag_pulls": Source("bag", {"open_end": 80, "middle": 30, "closed_end": 50, "side_to_side": 40}, astray=0.3),
     "bag_middle": Source("bag", {"middle": 100}, astray=0.8),
@@ -123,7 +128,7 @@ def features(source: Source) -> dict:
 
 def collect_franka(
     name: str, repo_id: str, root: str | Path, n_episodes: int | None, seed: int, workers: int = 1
-) -> "LeRobotDataset":
+) -> LeRobotDataset:
     """Record a source, or go on recording it.
 
     Args:
@@ -134,18 +139,13 @@ def collect_franka(
         ValueError: unknown source, no workers, or an unfinished recording of another source, seed or repo_id.
         FileExistsError: root exists.
     """
-    from lerobot.datasets.aggregate import aggregate_datasets
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-    from tqdm import tqdm
-
     if name not in SOURCES:
         raise ValueError(f"--source is {name!r}; expected one of {', '.join(SOURCES)}")
     if workers < 1:
         raise ValueError(f"--workers is {workers}; expected at least 1")
     source, root = SOURCES[name], Path(root)
     n_episodes = n_episodes or source.n_episodes
-    if root.exists():
-        raise FileExistsError(f"{root} exists; choose another --root or delete it")
+    refuse_existing(root, "--dataset.root")
     parts = root.with_name(root.name + ".parts")
     _claim(parts, f"{name} {repo_id} seed {seed}")
     size = min(EPISODES_A_PART, -(-n_episodes // workers))
@@ -174,12 +174,6 @@ def _claim(parts: Path, what: str) -> None:
 
 def _record_part(source: Source, repo_id: str, parts: Path, episodes: range, seed: int) -> Path:
     """The finished dataset of some episodes, recorded unless it is there."""
-    from lerobot.configs.video import RGBEncoderConfig
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
-    from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
-
     part = parts / f"{episodes.start:06d}_{episodes.stop:06d}"
     if part.exists():
         return part
@@ -200,10 +194,8 @@ def _record_part(source: Source, repo_id: str, parts: Path, episodes: range, see
     return unfinished.rename(part)
 
 
-def episode_frames(robot: "LatentSafeFrankaMujoco", source: Source, episode: int, seed: int) -> Iterator[dict]:
+def episode_frames(robot: LatentSafeFrankaMujoco, source: Source, episode: int, seed: int) -> Iterator[dict]:
     """The frames of an episode as `LeRobotDataset.add_frame` takes them; the first failing frame and all after fail."""
-    from lerobot_latentsafe.franka.behaviors import GRASPED, stray
-
     info, scene = SCENES[source.scene], robot.scene
     start = episode // source.branches if source.branches else episode
     robot.reset(_scene_seed(seed, start))
@@ -215,20 +207,18 @@ def episode_frames(robot: "LatentSafeFrankaMujoco", source: Source, episode: int
         _go(robot, stray(scene, GRASPED[source.behavior(episode)], rng))
     pushes = _pushes(source.pushed / info.fps, n_frames, rng)
     failed = False
-    with _operator(robot, source, episode) as act:
-        for push in pushes:
-            failed |= bool(scene.truth()["failure"])
-            seen = robot.get_observation()
-            sent = _send_pushed(robot, act(seen), push)
-            after = scene.truth()
+    with _operator(robot, source, episode) as operator:
+        actor = lambda seen: Choice(read_action(operator(seen), info.fps).delta)  # noqa: E731
+        for step in steps(PushedRobot(robot, pushes), actor):
+            failed |= bool(step.before["failure"])
             yield {
-                "observation.images.front": seen["front"],
-                "observation.images.wrist": seen["wrist"],
-                "observation.state": np.array([seen[name] for name in STATE_NAMES], np.float32),
-                "action": np.array([sent[name] for name in ACTION_NAMES], np.float32),
+                "observation.images.front": step.seen["front"],
+                "observation.images.wrist": step.seen["wrist"],
+                "observation.state": np.array([step.seen[name] for name in STATE_NAMES], np.float32),
+                "action": step.action.astype(np.float32),
                 "failure": np.array([FAILING if failed else SAFE]),
-                "next.reward": np.array([after["reward"]], np.float32),
-                "next.success": np.array([after["is_success"] and not failed]),
+                "next.reward": np.array([step.info["reward"]], np.float32),
+                "next.success": np.array([step.info["is_success"] and not failed]),
                 # Nothing ends by itself: an episode lasts its time, and its last state could go on.
                 "next.done": np.array([False]),
                 "task": scene.task,
@@ -237,37 +227,32 @@ def episode_frames(robot: "LatentSafeFrankaMujoco", source: Source, episode: int
 
 @contextmanager
 def _operator(
-    robot: "LatentSafeFrankaMujoco", source: Source, episode: int
+    robot: LatentSafeFrankaMujoco, source: Source, episode: int
 ) -> Iterator[Callable[[dict], dict[str, float]]]:
     """Who moves the robot in an episode: observation -> action, clipped into its limits."""
-    from lerobot_latentsafe.teleoperators.scripted.config_scripted import LatentSafeScriptedConfig
-    from lerobot_latentsafe.teleoperators.scripted.scripted import LatentSafeScripted
-
     behavior = source.behavior(episode)
     if source.policies:
-        operator = _policy_operator(behavior, robot.scene.fps, source.hand, source.shield)
+        operator = _policy_operator(behavior, robot.scene.fps, source.style, source.shield)
         operator.begin(robot.scene.seed)
         yield operator.act
         return
     with LatentSafeScripted(LatentSafeScriptedConfig(behavior=behavior, seed=episode)) as scripted:
-        if source.hand is None:
+        if source.style is None:
             yield lambda seen: scripted.get_action()
             return
         rng = np.random.default_rng([9, robot.scene.seed])
-        interruptions = Interruptions(source.hand, action_limits(robot.scene.fps), rng)
-        yield lambda seen: _interrupted(scripted.get_action(), interruptions)
+        interventions = Interventions(source.style, action_limits(robot.scene.fps), rng)
+        yield lambda seen: _intervened(scripted.get_action(), interventions)
 
 
-def _interrupted(action: dict[str, float], interruptions: Interruptions) -> dict[str, float]:
-    executed, _ = interruptions(np.array([action[name] for name in ACTION_NAMES]))
+def _intervened(action: dict[str, float], interventions: Interventions) -> dict[str, float]:
+    executed, _ = interventions(np.array([action[name] for name in ACTION_NAMES]))
     return dict(zip(ACTION_NAMES, executed.tolist()))
 
 
 @cache
-def _policy_operator(path: str, fps: int, hand: Hand, shield: str | None) -> "PolicyOperator":
-    from lerobot_latentsafe.collection.policy_operator import PolicyOperator
-
-    return PolicyOperator(path, fps, hand, shield)
+def _policy_operator(path: str, fps: int, style: InterventionStyle, shield: str | None) -> PolicyOperator:
+    return PolicyOperator(path, fps, style, shield)
 
 
 def _pushes(sd: float, n: int, rng: np.random.Generator) -> np.ndarray:
@@ -277,30 +262,47 @@ def _pushes(sd: float, n: int, rng: np.random.Generator) -> np.ndarray:
     return np.repeat(np.column_stack([moves, np.where(closes, -1.0, 0.0)]), rng.integers(3, 11, n), axis=0)[:n]
 
 
-def _send_pushed(robot: "LatentSafeFrankaMujoco", action: dict[str, float], push: np.ndarray) -> dict[str, float]:
-    """Act, pushed by (7,) unless the fingers are to close. Returns the action, clipped into its limits."""
-    wanted = read_action(action, robot.scene.fps).delta
-    pushed = wanted + push * (wanted[6] > 0.5)
-    if robot.scene.controller.position[2] < HIGH:  # fingers that have closed on something are to stay closed
-        pushed[6] = wanted[6]
-    robot.send_action(dict(zip(ACTION_NAMES, np.clip(pushed, *action_limits(robot.scene.fps)).tolist())))
-    return dict(zip(ACTION_NAMES, wanted.tolist()))
+class PushedRobot:
+    """A robot as a world of one episode, whose hand is pushed while it acts; `info` is its scene's truth.
+
+    Args:
+        pushes: what is added to the action of each step (T, 7), unless that closes the fingers.
+    """
+
+    def __init__(self, robot: LatentSafeFrankaMujoco, pushes: np.ndarray):
+        self.robot, self.pushes, self.t = robot, pushes, 0
+        self.info = robot.scene.truth()
+
+    @property
+    def over(self) -> np.ndarray:
+        """Whether the last step is done: bool (1,)."""
+        return np.array([self.t >= len(self.pushes)])
+
+    def observe(self) -> dict:
+        """An observation of a LeRobot robot."""
+        return self.robot.get_observation()
+
+    def step(self, action: np.ndarray) -> None:
+        """Act (7,), within limits."""
+        scene, pushed = self.robot.scene, action + self.pushes[self.t] * (action[6] > 0.5)
+        if scene.controller.position[2] < HIGH:  # fingers that have closed on something are to stay closed
+            pushed[6] = action[6]
+        self.robot.send_action(dict(zip(ACTION_NAMES, np.clip(pushed, *action_limits(scene.fps)).tolist())))
+        self.info, self.t = scene.truth(), self.t + 1
 
 
 def _scene_seed(seed: int, start: int) -> int:
     return 1_000_000 * seed + start
 
 
-def _grasp(robot: "LatentSafeFrankaMujoco", seed: int, source: Source) -> int:
+def _grasp(robot: LatentSafeFrankaMujoco, seed: int, source: Source) -> int:
     """Close the fingers on the bag, unrecorded. Returns the steps taken."""
-    from lerobot_latentsafe.franka.behaviors import grasp
-
     rng = np.random.default_rng([7, seed])
     segment = rng.choice(len(source.grasps), p=source.grasps)
     return _go(robot, grasp(robot.scene, int(segment), rng, clumsiness=source.clumsiness))
 
 
-def _go(robot: "LatentSafeFrankaMujoco", actions: Iterator[np.ndarray]) -> int:
+def _go(robot: LatentSafeFrankaMujoco, actions: Iterator[np.ndarray]) -> int:
     """Act, unrecorded. Returns the steps taken."""
     steps = 0
     for steps, action in enumerate(actions, 1):  # noqa: B007

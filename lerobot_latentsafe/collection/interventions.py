@@ -1,16 +1,16 @@
-"""Somebody else's hand on the robot of a recording: what comes of holding still and of lowering is to be seen too."""
+"""Somebody else intervenes in a recording: what comes of holding still and of lowering is to be seen, too."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
 CLOSING = 0.5
-"""Command of the fingers below which they are to hold something; nobody interrupts before."""
+"""Command of the fingers below which they are to hold something; nobody intervenes before."""
 
 
 @dataclass(frozen=True)
-class Hand:
-    """What an interruption is like, each drawn anew.
+class InterventionStyle:
+    """What an intervention is like, each drawn anew.
 
     Attributes:
         chance: that one begins at a step.
@@ -25,35 +25,35 @@ class Hand:
     speed: tuple[float, float]
 
 
-BRIEF = Hand(chance=0.06, steps=(2, 13), down=0.6, speed=(0.2, 1.0))
-RETREATING = Hand(chance=0.05, steps=(4, 41), down=0.7, speed=(0.15, 0.5))
+BRIEF = InterventionStyle(chance=0.06, steps=(2, 13), down=0.6, speed=(0.2, 1.0))
+RETREATING = InterventionStyle(chance=0.05, steps=(4, 41), down=0.7, speed=(0.15, 0.5))
 """Slow enough not to shake out what is held, and long enough to come down with it."""
 
 
-class Interruptions:
+class Interventions:
     """Takes over for some steps, with the fingers left as they are.
 
     Args:
-        hand: what an interruption is like.
+        style: what an intervention is like.
         limits: of an action, least and largest (7,).
         rng: source of all draws.
     """
 
-    def __init__(self, hand: Hand, limits: tuple[np.ndarray, np.ndarray], rng: np.random.Generator):
-        self.hand, self.limits, self.rng = hand, limits, rng
+    def __init__(self, style: InterventionStyle, limits: tuple[np.ndarray, np.ndarray], rng: np.random.Generator):
+        self.style, self.limits, self.rng = style, limits, rng
         self.left, self.motion, self.gripper = 0, np.zeros(6), 1.0
 
     def __call__(self, action: np.ndarray, begin: bool | None = None) -> tuple[np.ndarray, bool]:
-        """What is executed (7,), and whether that is the interruption's.
+        """What is executed (7,), and whether that is the intervention's.
 
         Args:
             action: what the operator does, (7,).
             begin: whether one begins, if none goes on; None: by chance, and while the fingers close only.
         """
         if self.left == 0 and self._begins(begin):
-            self.left = int(self.rng.integers(*self.hand.steps))
-            down = self.rng.random() < self.hand.down
-            self.motion = np.array([0, 0, down * self.rng.uniform(*self.hand.speed) * self.limits[0][2], 0, 0, 0])
+            self.left = int(self.rng.integers(*self.style.steps))
+            down = self.rng.random() < self.style.down
+            self.motion = np.array([0, 0, down * self.rng.uniform(*self.style.speed) * self.limits[0][2], 0, 0, 0])
         self.left = max(0, self.left - 1)
         if self.left:
             action = np.append(self.motion, self.gripper)
@@ -63,4 +63,4 @@ class Interruptions:
     def _begins(self, begin: bool | None) -> bool:
         if begin is not None:
             return begin
-        return self.gripper < CLOSING and self.rng.random() < self.hand.chance
+        return self.gripper < CLOSING and self.rng.random() < self.style.chance

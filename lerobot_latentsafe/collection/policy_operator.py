@@ -10,10 +10,11 @@ from lerobot.utils.constants import OBS_IMAGES, OBS_STATE, OBS_STR
 from lerobot.utils.feature_utils import build_dataset_frame
 
 from lerobot_latentsafe.base_policy import BasePolicy
-from lerobot_latentsafe.collection.interventions import Hand, Interruptions
+from lerobot_latentsafe.collection.interventions import Interventions, InterventionStyle
+from lerobot_latentsafe.decision import LawOptions
 from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES, action_limits
 from lerobot_latentsafe.franka.scene import CAMERAS
-from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+from lerobot_latentsafe.modeling_latentsafe import load_filter
 
 OBSERVED = {
     OBS_STATE: {"dtype": "float32", "shape": (len(STATE_NAMES),), "names": STATE_NAMES},
@@ -23,32 +24,30 @@ OBSERVED = {
 
 
 class PolicyOperator:
-    """Acts as a policy does that is interrupted: what it does next it does in no other recording.
+    """Acts as a policy does in which somebody intervenes: what it does next it does in no other recording.
 
     Either when a filter would override it; or, for want of one that is any good yet, now and then.
 
     Args:
         path: of the policy; folder, Hub id or committed name.
         fps: of the robot.
-        hand: what an interruption is like.
-        shield: path of a filter that says when to interrupt.
+        style: what an intervention is like.
+        shield: path of a filter that says when to intervene.
     """
 
-    def __init__(self, path: str, fps: int, hand: Hand, shield: str | None = None):
-        self.limits, self.hand, self.filter = action_limits(fps), hand, None
+    def __init__(self, path: str, fps: int, style: InterventionStyle, shield: str | None = None):
+        self.limits, self.style, self.filter = action_limits(fps), style, None
         if shield is None:
-            self.policy = BasePolicy(path, "cpu")
+            self.policy = BasePolicy.load(path)
             return
-        self.filter = LatentSafePolicy.from_pretrained(shield).eval()
-        self.filter.config.mode = "monitor"
-        self.filter.attach(path)
+        self.filter = load_filter(shield, law=LawOptions(mode="monitor"), base_policy=path)
         self.policy = self.filter.base
 
     def begin(self, seed: int) -> None:
         """Start an episode; what follows depends on the seed and on what is seen."""
         torch.manual_seed(seed)
         (self.filter or self.policy).reset()
-        self.interruptions = Interruptions(self.hand, self.limits, np.random.default_rng([9, seed]))
+        self.interventions = Interventions(self.style, self.limits, np.random.default_rng([9, seed]))
 
     @torch.no_grad()
     def act(self, seen: Mapping[str, Any]) -> dict[str, float]:
@@ -60,9 +59,9 @@ class PolicyOperator:
             decision = self.filter.decide(batch)
             proposed, unsafe = decision.proposed, decision.unsafe.item()
         proposed = np.clip(proposed[0].double().numpy(), *self.limits)
-        action, interrupted = self.interruptions(proposed, unsafe)
+        action, intervened = self.interventions(proposed, unsafe)
         executed = torch.from_numpy(action).float()[None]
-        if interrupted:
+        if intervened:
             self.policy.replan(executed)
         if self.filter is not None:
             self.filter.shield.was_executed(executed)

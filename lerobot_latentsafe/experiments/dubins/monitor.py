@@ -1,6 +1,6 @@
 """How close a safety monitor comes to the exact safe set, and how good its fallback policy is (Table 1)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Protocol
 
 import numpy as np
@@ -10,9 +10,15 @@ from torch import Tensor
 from lerobot_latentsafe.critic import SafetyCritic
 from lerobot_latentsafe.dubins import car
 from lerobot_latentsafe.dubins.ground_truth import exact_value
+from lerobot_latentsafe.evaluation.rollouts import Choice, steps
 from lerobot_latentsafe.evaluation.statistics import confusion
-from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+from lerobot_latentsafe.experiments.dubins.privileged import DubinsImagination
+from lerobot_latentsafe.latent import Latent
 from lerobot_latentsafe.reachability import look_ahead
+from lerobot_latentsafe.safety_model import SafetyModel
+
+Driver = Callable[[np.ndarray], np.ndarray]
+"""Called with the current states (N, 3) at each tick, gives turn rates (N,)."""
 
 
 class Monitor(Protocol):
@@ -21,89 +27,94 @@ class Monitor(Protocol):
     def value(self, states: np.ndarray) -> np.ndarray:
         """V of states (N, 3) -> (N,); safe where positive."""
 
-    def start(self) -> Callable[[np.ndarray], np.ndarray]:
-        """A fresh fallback policy: called with the current states (N, 3) at each tick, gives turn rates (N,)."""
+    def start(self) -> Driver:
+        """A fresh fallback policy."""
 
 
 class LatentMonitor:
-    """A latent safety filter that sees the car through its camera.
+    """The safety model of a filter that sees the car through its camera.
 
     For V, a state is shown as a history of two frames: the one before it under a straight action, and itself.
     The fallback policy filters every frame of its rollout.
     """
 
-    def __init__(self, policy: LatentSafePolicy, chunk: int = 2048):
-        policy.require_stage("reachability")
-        names, fps = policy.config.state_names, policy.config.fps
+    def __init__(self, model: SafetyModel, chunk: int = 2048):
+        model.require_stage("critic")
+        names, fps = model.config.trained_on.state_names, model.config.trained_on.fps
         if fps != car.FPS or names != car.STATE_NAMES:
             raise ValueError(
                 f"this filter was trained at {fps} fps on {names}; the car runs at {car.FPS} fps with {car.STATE_NAMES}"
             )
-        self.policy, self.chunk = policy, chunk
+        self.model, self.chunk = model, chunk
         self.renderer = car.Renderer()
 
     @torch.no_grad()
     def value(self, states: np.ndarray) -> np.ndarray:
-        parts = [self.policy.value(self.latent(states[i : i + self.chunk])) for i in range(0, len(states), self.chunk)]
+        """V of states (N, 3) after the two-frame history."""
+        parts = [self.model.value(latent) for latent in self.latents(states)]
         return torch.cat(parts).cpu().numpy()
 
     @torch.no_grad()
     def margin(self, states: np.ndarray) -> np.ndarray:
         """Bounded margin l: what the failure classifier alone would say."""
-        parts = []
-        for i in range(0, len(states), self.chunk):
-            features = self.policy.world_model.features(self.latent(states[i : i + self.chunk]))
-            parts.append(self.policy.margin.bounded(features))
+        parts = [self.model.imagination.margin(latent) for latent in self.latents(states)]
         return torch.cat(parts).cpu().numpy()
 
+    def latents(self, states: np.ndarray) -> Iterator[Latent]:
+        """Those of `latent`, of so many states at a time as fit in memory."""
+        for i in range(0, len(states), self.chunk):
+            yield self.latent(states[i : i + self.chunk])
+
     @torch.no_grad()
-    def latent(self, states: np.ndarray) -> dict[str, Tensor]:
+    def latent(self, states: np.ndarray) -> Latent:
         """Posterior latents of states (N, 3) after the two-frame history."""
         heading = states[:, 2]
         travelled = car.DT * car.SPEED * np.stack([np.cos(heading), np.sin(heading)], -1)
         before = np.concatenate([states[:, :2] - travelled, heading[:, None]], -1)
-        straight = self.policy.normalise_action(torch.tensor([[0.0, car.SPEED]], device=self.policy.device))
-        latent = self.policy.world_model.observe(None, None, *self._see(before))
-        return self.policy.world_model.observe(latent, straight.expand(len(states), -1), *self._see(states))
+        units, world_model = self.model.units, self.model.world_model
+        straight = units.normalise_action(torch.tensor([[0.0, car.SPEED]], device=units.device))
+        latent = world_model.observe(None, None, *self._see(before))
+        return world_model.observe(latent, straight.expand(len(states), -1), *self._see(states))
 
-    def start(self) -> Callable[[np.ndarray], np.ndarray]:
-        return self.drive(lambda latent: self.policy.plan(latent)[1])
+    def start(self) -> Driver:
+        """The fallback policy."""
+        return self.drive(lambda latent: self.model.plan(latent)[1])
 
-    def drive(self, choose: Callable[[dict[str, Tensor]], Tensor]) -> Callable[[np.ndarray], np.ndarray]:
+    def drive(self, choose: Callable[[Latent], Tensor]) -> Driver:
         """A driver that filters every frame it sees and takes the action (N, A) chosen for the latent."""
-        policy = self.policy
-        latent, action = None, None
+        model, latent, action = self.model, None, None
 
         @torch.no_grad()
         def act(states: np.ndarray) -> np.ndarray:
             nonlocal latent, action
-            latent = policy.world_model.observe(latent, action, *self._see(states))
+            latent = model.world_model.observe(latent, action, *self._see(states))
             action = choose(latent)
-            return policy.denormalise_action(action).cpu().numpy()[:, 0]
+            return model.units.denormalise_action(action).cpu().numpy()[:, 0]
 
         return act
 
     def _see(self, states: np.ndarray) -> tuple[dict[str, Tensor], Tensor]:
         seen = car.observe(states, self.renderer)
-        image = torch.from_numpy(seen["image"]).permute(0, 3, 1, 2).to(self.policy.device)
-        images = {key: self.policy.model_images(image) for key in self.policy.world_model.image_keys}
-        return self.policy.world_model.perceive(images), self.policy.normalise_state(
-            torch.from_numpy(seen["heading"]).to(self.policy.device)
-        )
+        image = torch.from_numpy(seen["image"]).permute(0, 3, 1, 2)
+        images = dict.fromkeys(self.model.world_model.image_keys, image)
+        return self.model.see({**images, "observation.state": torch.from_numpy(seen["heading"])})
 
 
 class PrivilegedMonitor:
     """The same learner's critic on the true state."""
 
-    def __init__(self, imagination, critic: SafetyCritic):
+    def __init__(self, imagination: DubinsImagination, critic: SafetyCritic):
         self.imagination, self.critic = imagination, critic
 
     @torch.no_grad()
     def value(self, states: np.ndarray) -> np.ndarray:
+        """V of states (N, 3)."""
         latent = {"state": torch.from_numpy(states).float()}
         return self.critic.value(self.imagination.features(latent), self.imagination.margin(latent)).numpy()
 
-    def start(self) -> Callable[[np.ndarray], np.ndarray]:
+    def start(self) -> Driver:
+        """The critic's policy."""
+
         @torch.no_grad()
         def act(states: np.ndarray) -> np.ndarray:
             features = self.imagination.features({"state": torch.from_numpy(states).float()})
@@ -121,17 +132,19 @@ class PlanMonitor:
     def __init__(self, latent: LatentMonitor, horizon: int = 25):
         self.latent_monitor, self.horizon = latent, horizon
 
+    @torch.no_grad()
     def value(self, states: np.ndarray) -> np.ndarray:
-        monitor, size = self.latent_monitor, self.latent_monitor.chunk
-        parts = [self._plan(monitor.latent(states[i : i + size]))[0] for i in range(0, len(states), size)]
+        """V of states (N, 3) after the two-frame history."""
+        parts = [self._plan(latent)[0] for latent in self.latent_monitor.latents(states)]
         return torch.cat(parts).cpu().numpy()
 
-    def start(self) -> Callable[[np.ndarray], np.ndarray]:
+    def start(self) -> Driver:
+        """The first action of the best plan, anew at each tick."""
         return self.latent_monitor.drive(lambda latent: self._plan(latent)[1])
 
-    def _plan(self, latent: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        policy = self.latent_monitor.policy
-        return look_ahead(policy.imagination, latent, policy.critic.held_actions(), self.horizon)
+    def _plan(self, latent: Latent) -> tuple[Tensor, Tensor]:
+        model = self.latent_monitor.model
+        return look_ahead(model.imagination, latent, model.critic.held_actions(), self.horizon)
 
 
 def feasible_starts(truth: Callable[[np.ndarray], np.ndarray] = exact_value) -> np.ndarray:
@@ -153,23 +166,47 @@ def boundary_starts(n: int, seed: int, low: float = 0.0, high: float = 0.05) -> 
     return np.concatenate(found)[:n]
 
 
+class CarWorld:
+    """The car in many states side by side; one that has left the camera's view stays there, and its run is over.
+
+    Actors see states (N, 3) and choose turn rates (N,).
+
+    Attributes:
+        info: the states, and which of them are failures in view: bool (N,).
+    """
+
+    def __init__(self, starts: np.ndarray, n_steps: int):
+        self.left, self._visible = n_steps, np.ones(len(starts), bool)
+        self.info = (starts.copy(), np.zeros(len(starts), bool))
+
+    @property
+    def over(self) -> np.ndarray:
+        """Which are out of view, or all after the last step: bool (N,)."""
+        return ~self._visible | (self.left == 0)
+
+    def observe(self) -> np.ndarray:
+        """The states."""
+        return self.info[0]
+
+    def step(self, turn_rates: np.ndarray) -> None:
+        """Drive on."""
+        states, _ = self.info
+        states = np.where(self._visible[:, None], car.step(states, turn_rates), states)
+        self._visible = self._visible & car.in_view(states)
+        self.info, self.left = (states, self._visible & (car.margin(states) < 0)), self.left - 1
+
+
 def safe_policy_rollouts(monitor: Monitor, starts: np.ndarray, n_steps: int = 100) -> dict:
     """Let the fallback policy drive from each start: {safe, n} and the trajectories.
 
     A run is safe if the car never enters the failure set within `n_steps` while it is in the camera's view;
     a car that has left the view is no longer seen and its run is over.
     """
-    act = monitor.start()
-    states, failed = starts.copy(), np.zeros(len(starts), bool)
-    visible = np.ones(len(starts), bool)
-    trajectory = [states]
-    for _ in range(n_steps):
-        states = np.where(visible[:, None], car.step(states, act(states)), states)
-        visible &= car.in_view(states)
-        failed |= visible & (car.margin(states) < 0)
+    act, failed, trajectory = monitor.start(), np.zeros(len(starts), bool), [starts]
+    for step in steps(CarWorld(starts, n_steps), lambda states: Choice(act(states))):
+        states, failing = step.info
+        failed |= failing
         trajectory.append(states)
-        if not visible.any():
-            break
     return {
         "safe": int((~failed).sum()),
         "n": len(starts),

@@ -16,7 +16,7 @@ def car_parts(policy: LatentSafePolicy, result: dict | None, folder: Path) -> li
         parts.append(
             html.picture(folder / "paths.png", "Where the car went. Red entered the disc; orange: the filter acts.")
         )
-    figures.save(value_slices({"latent": LatentMonitor(policy)}), folder / "slices.png")
+    figures.save(value_slices({"latent": LatentMonitor(policy.model)}), folder / "slices.png")
     return [
         *parts,
         html.heading("The safe set it learnt from images"),

@@ -5,6 +5,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from lerobot.teleoperators.phone.phone_processor import MapPhoneActionToRobotAction
 from lerobot.teleoperators.teleoperator import Teleoperator
 from lerobot.teleoperators.utils import make_teleoperator_from_config
 
@@ -95,8 +96,6 @@ class LatentSafeEndEffector(Teleoperator):
         if not said:
             self._held_at = None
             return still
-        from lerobot.teleoperators.phone.phone_processor import MapPhoneActionToRobotAction
-
         mapped = MapPhoneActionToRobotAction(platform=self.config.device.phone_os).action(dict(said))
         self._opening = float(np.clip(self._opening + 0.1 * mapped["gripper_vel"], 0, 1))
         still[6] = self._opening

@@ -8,6 +8,8 @@ from lerobot.teleoperators.teleoperator import Teleoperator
 from lerobot.utils.errors import DeviceNotConnectedError
 
 from lerobot_latentsafe.franka.actions import ACTION_NAMES, action_limits
+from lerobot_latentsafe.franka.behaviors import begin
+from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import connected_simulation
 from lerobot_latentsafe.teleoperators.scripted.config_scripted import LatentSafeScriptedConfig
 
 
@@ -55,9 +57,6 @@ class LatentSafeScripted(Teleoperator):
         """The next action; clipped into its limits, so that what is recorded is what is executed."""
         if not self._connected:
             raise DeviceNotConnectedError(f"{self} is not connected; call connect() first")
-        from lerobot_latentsafe.franka.behaviors import begin
-        from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import connected_simulation
-
         robot = connected_simulation()
         if self._episode != (robot, robot.episode):
             self._episode = (robot, robot.episode)
