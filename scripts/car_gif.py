@@ -1,7 +1,7 @@
 #!/usr/bin/env python
 """The moving picture of README: a reckless policy of the car, bare and shielded, from the same starts.
 
-    scripts/car_gif.py [--output=docs/images/car.gif]
+scripts/car_gif.py [--output=docs/images/car.gif]
 """
 
 import argparse
@@ -15,9 +15,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 from PIL import Image
 
-from lerobot_latentsafe import LatentSafeDubinsEnv, load_filter
+from lerobot_latentsafe import evaluate_filter, load_filter
 from lerobot_latentsafe.dubins.car import RADIUS
-from lerobot_latentsafe.evaluation.rollouts import Episodes, compare
+from lerobot_latentsafe.evaluation.rollouts import Episodes
 
 TITLES = {"bare": "without a filter", "shielded": "with a filter"}
 EVERY, LINGER, MS = 2, 12, 80
@@ -57,7 +57,7 @@ def main() -> None:
     parser.add_argument("--n", type=int, default=12)
     arguments = parser.parse_args()
     shielded = load_filter("dubins", base_policy="dubins_diffusion_reckless")
-    episodes = compare(shielded, LatentSafeDubinsEnv(), arguments.n, seed=0)["episodes"]
+    episodes = evaluate_filter(shielded, "latentsafe_dubins", arguments.n)["episodes"]
     driven = {name: paths(runs) for name, runs in episodes.items()}
     last = max(len(path) for runs in driven.values() for path, _ in runs)
     pictures = [picture(driven, step) for step in range(0, last + EVERY, EVERY)]
