@@ -7,15 +7,15 @@ OUT=${1:-data}
 export HF_HUB_OFFLINE=1 OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
 for source in bag_mix bag_branches bag_climbs bag_lifts bag_between bag_dither bag_clumsy bag_middle bag_strong bag_weak blocks_demos blocks_random; do
   [ -e "$OUT/$source" ] && continue
-  .venv/bin/latentsafe collect --source="$source" --repo_id="latentsafe/$source" --root="$OUT/$source"
+  .venv/bin/latentsafe collect --source="$source" --dataset.repo_id="latentsafe/$source" --dataset.root="$OUT/$source"
 done
 # Of bags that no other source shows: all sources of one seed start from the same.
-[ -e "$OUT/bag_policies" ] || .venv/bin/latentsafe collect --source=bag_policies --repo_id=latentsafe/bag_policies \
-  --root="$OUT/bag_policies" --seed=23 --n_episodes=175
-[ -e "$OUT/bag_pulls" ] || .venv/bin/latentsafe collect --source=bag_pulls --repo_id=latentsafe/bag_pulls \
-  --root="$OUT/bag_pulls" --seed=25
-[ -e "$OUT/bag_retreats" ] || .venv/bin/latentsafe collect --source=bag_retreats --repo_id=latentsafe/bag_retreats \
-  --root="$OUT/bag_retreats" --seed=31 --n_episodes=100
+[ -e "$OUT/bag_policies" ] || .venv/bin/latentsafe collect --source=bag_policies --dataset.repo_id=latentsafe/bag_policies \
+  --dataset.root="$OUT/bag_policies" --seed=23 --dataset.num_episodes=175
+[ -e "$OUT/bag_pulls" ] || .venv/bin/latentsafe collect --source=bag_pulls --dataset.repo_id=latentsafe/bag_pulls \
+  --dataset.root="$OUT/bag_pulls" --seed=25
+[ -e "$OUT/bag_retreats" ] || .venv/bin/latentsafe collect --source=bag_retreats --dataset.repo_id=latentsafe/bag_retreats \
+  --dataset.root="$OUT/bag_retreats" --seed=31 --dataset.num_episodes=100
 # Interrupted where the committed filter would act.
-[ -e "$OUT/bag_shielded" ] || .venv/bin/latentsafe collect --source=bag_shielded --repo_id=latentsafe/bag_shielded \
-  --root="$OUT/bag_shielded" --seed=29 --n_episodes=100
+[ -e "$OUT/bag_shielded" ] || .venv/bin/latentsafe collect --source=bag_shielded --dataset.repo_id=latentsafe/bag_shielded \
+  --dataset.root="$OUT/bag_shielded" --seed=29 --dataset.num_episodes=100

@@ -11,8 +11,8 @@ mkdir -p "$OUT"
 [ -e "$OUT/cost.csv" ] || echo "step,user_s,system_s" >"$OUT/cost.csv"
 
 record() { # name source seed [episodes]
-  [ -e "$DATA/$1" ] || $BIN/latentsafe collect --source="$2" --repo_id="latentsafe/$1" --root="$DATA/$1" --seed="$3" \
-    ${4:+--n_episodes="$4"}
+  [ -e "$DATA/$1" ] || $BIN/latentsafe collect --source="$2" --dataset.repo_id="latentsafe/$1" \
+    --dataset.root="$DATA/$1" --seed="$3" ${4:+--dataset.num_episodes="$4"}
 }
 
 timed() { # name command... : user and system CPU seconds of the command go to $OUT/cost.csv

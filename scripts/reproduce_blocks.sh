@@ -28,9 +28,9 @@ fi
       [ -e "$OUT/$target/seed_$seed/integrity.json" ] || $BIN/latentsafe train-reachability --seeds="[$seed]" \
         --policy.path="$OUT/dreamer/policy/world_model" --dataset.repo_id=local/blocks_dreamer \
         --dataset.root="$OUT/dreamer/episodes" --output_dir="$OUT/$target/seed_$seed" --target=$target $critic
-      # As filters are committed: 16 bits, no decoders. Guard 5 was chosen on 40 starts of the curve.
+      # As filters are committed: 16 bits, no decoders. 5 steps were chosen on 40 starts of the curve.
       [ -e "$OUT/$target/final_$seed" ] || $BIN/latentsafe wrap --policy.path="$OUT/$target/seed_$seed" \
-        --output_dir="$OUT/$target/final_$seed" --guard=5 --half=true --drawing=false
+        --output_dir="$OUT/$target/final_$seed" --law.proposal_steps=5 --half=true --drawing=false
     done
   done
 

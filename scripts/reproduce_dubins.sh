@@ -11,7 +11,8 @@ mkdir -p "$OUT"
 data() { # source episodes
   [ -e "$OUT/$1_cache/frame_cache/manifest.json" ] && return
   rm -rf "$OUT/$1" "$OUT/$1_cache"
-  $BIN/latentsafe collect --source="$1" --repo_id="latentsafe/dubins_$1" --root="$OUT/$1" --n_episodes="$2"
+  $BIN/latentsafe collect --source="$1" --dataset.repo_id="latentsafe/dubins_$1" --dataset.root="$OUT/$1" \
+    --dataset.num_episodes="$2"
   $BIN/latentsafe cache --dataset.repo_id="latentsafe/dubins_$1" --dataset.root="$OUT/$1" --output_dir="$OUT/$1_cache"
 }
 
@@ -25,7 +26,7 @@ filter() { # name source seed candidates [more options of lerobot-train]
     rm -rf "$wm"
     $BIN/lerobot-train --config_path=configs/dubins_rssm.yaml --dataset.repo_id="latentsafe/dubins_${source}_cache" \
       --dataset.root="$OUT/${source}_cache" --policy.frame_cache="$OUT/${source}_cache" \
-      --policy.action_candidates="$candidates" --output_dir="$wm" --seed="$seed" --steps=$steps \
+      --policy.fallback.action_candidates="$candidates" --output_dir="$wm" --seed="$seed" --steps=$steps \
       --policy.scheduler_steps=$steps --save_freq=1000 "$@"
   fi
   touch "$wm/done"
@@ -57,7 +58,7 @@ data reckless 100
 data careful 300
 diffusion reckless
 diffusion careful --steps=3000
-law="--epsilon=0.97 --guard=6" # chosen on starts 5000 to 5049; the table's are 1000 to 1199
+law="--law.epsilon=0.97 --law.proposal_steps=6" # chosen on starts 5000 to 5049; the table's are 1000 to 1199
 for seed in 0 1 2; do
   for base in reckless careful; do
     $BIN/latentsafe eval-shield --policy.path="$OUT/filter_$seed" --env.type=latentsafe_dubins --n_episodes=200 --seed=1000 $law \

@@ -20,8 +20,8 @@ def recorded(source):
     """fps, robot type and features of a source's dataset."""
     if source in SOURCES:
         return 20, "latentsafe_dubins", {**FEATURES, **(POSITION if source in WITH_POSITION else {})}
-    franka = franka.SOURCES[source]
-    return SCENES[franka.scene].fps, "latentsafe_franka_mujoco", franka.features(franka)
+    of_franka = franka.SOURCES[source]
+    return SCENES[of_franka.scene].fps, "latentsafe_franka_mujoco", franka.features(of_franka)
 
 
 @pytest.mark.parametrize("card", CARDS)

@@ -1,6 +1,6 @@
 """What the scripted operators do: generators of actions, from privileged knowledge of a simulated scene.
 
-A behaviour yields actions (7,) as of `robots/franka_interface.py` and ends when it has nothing more to do. It looks at
+A behaviour yields actions (7,) as of `franka/actions.py` and ends when it has nothing more to do. It looks at
 the scene again before every action, as a person would.
 """
 

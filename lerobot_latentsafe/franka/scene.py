@@ -145,7 +145,7 @@ class FrankaScene:
         raise NotImplementedError
 
     def step(self, action: np.ndarray) -> None:
-        """Advance one control step. action: (7,), see `robots/franka_interface.py`; clipped into its limits.
+        """Advance one control step. action: (7,), see `franka/actions.py`; clipped into its limits.
 
         A motion to a pose the arm cannot reach is not begun: the arm stays, only the fingers move.
         """
