@@ -12,12 +12,12 @@ from lerobot_latentsafe.cli import main
 from lerobot_latentsafe.datasets.episodes import DatasetFrames
 from lerobot_latentsafe.datasets.labels import FailureLabels
 from lerobot_latentsafe.dubins import car
+from lerobot_latentsafe.dubins.labeller import dubins_truth
 from lerobot_latentsafe.labeling.automatic import (
     AnswerError,
     ChatEndpoint,
     VisionLanguageLabeller,
     as_vector,
-    dubins_truth,
     find_labeller,
     label_automatically,
     parse_answer,

@@ -2,11 +2,13 @@ import numpy as np
 import pytest
 import tiny
 import torch
-from lerobot_latentsafe.commands import Calibrate, DatasetSource, PolicySource
+from lerobot_latentsafe.cli.options import DatasetSource, PolicySource
+from lerobot_latentsafe.cli.train import Calibrate
 
 from lerobot_latentsafe.calibration import calibrate, episode_values, store
-from lerobot_latentsafe.datasets.clips import ClipReader
-from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, UntrainedFilterError
+from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+from lerobot_latentsafe.safety_model import UntrainedFilterError
+from lerobot_latentsafe.training import load_with_cache
 
 
 def failing(values, first_failure):
@@ -59,22 +61,21 @@ def test_one_kind_of_episode_is_not_enough(rows):
 
 
 def test_values_along_episodes_are_those_of_filtering(tiny_filter, cache_meta):
-    policy = LatentSafePolicy.from_pretrained(tiny_filter)
-    reader = ClipReader.of_dataset(policy.config, cache_meta)
-    rows = episode_values(policy, reader, np.array([2, 5]))
+    policy, reader = load_with_cache(tiny_filter, cache_meta)
+    rows = episode_values(policy.model, reader, np.array([2, 5]))
     length = policy.config.world_model.clip_length
     for episode, row in zip((2, 5), rows):
         index = np.flatnonzero(reader.labels.episode == episode)
         assert len(row["value"]) == len(index)
         np.testing.assert_array_equal(row["failure"], reader.labels.failure[index])
-        clip = reader.cut(index[:1], policy)
-        encoded = {key: value[0] for key, value in policy.world_model.encode(clip).items()}
-        np.testing.assert_allclose(row["value"][:length], policy.value(encoded).detach(), atol=1e-5)
+        clip = reader.cut(index[:1], policy.model.world_model.percept_names)
+        encoded = {key: value[0] for key, value in policy.model.world_model.encode(clip).items()}
+        np.testing.assert_allclose(row["value"][:length], policy.model.value(encoded).detach(), atol=1e-5)
 
 
 def test_evidence_is_kept_in_the_config(policy):
-    store(policy, calibrate([FAILING, safe(1.0)], lead_steps=2))
-    assert policy.config.epsilon == pytest.approx(0.3)
+    store(policy.config, calibrate([FAILING, safe(1.0)], lead_steps=2))
+    assert policy.config.law.epsilon == pytest.approx(0.3)
     assert policy.config.calibration["failing_episodes"] == 1.0
 
 
@@ -82,7 +83,7 @@ def test_command_writes_a_filter_with_epsilon_and_evidence(tiny_filter, cache_ro
     dataset = DatasetSource(tiny.REPO_ID, str(cache_root))
     Calibrate(PolicySource(str(tiny_filter)), tmp_path / "out", dataset, max_missed=1.0).run()
     config = LatentSafePolicy.from_pretrained(tmp_path / "out").config
-    assert config.calibration["epsilon"] == config.epsilon and config.stage == "reachability"
+    assert config.calibration["epsilon"] == config.law.epsilon and config.trained_on.stage == "critic"
     assert config.frame_cache is None  # a folder of this machine has no business in a checkpoint
 
 
@@ -105,14 +106,14 @@ def test_untrained_critic_cannot_be_calibrated(tiny_world_model, cache_root, tmp
 
 def test_episodes_start_with_the_grip_they_had(cache_meta):
     """A kept command has no zero to start from: calibration and training begin an episode alike."""
-    policy = tiny.new_policy(cache_meta, action_candidates=None, kept_commands=["turn_rate.vel"])
-    policy.config.law = "margin"
-    policy.config.stage = "world_model"
+    policy = tiny.new_policy(cache_meta, fallback_action_candidates=None, fallback_frozen_commands=["turn_rate.vel"])
+    policy.config.law.name = "margin"
+    policy.config.trained_on.stage = "world_model"
     index = np.flatnonzero(policy.reader.labels.episode == 2)
-    clip = policy.reader.cut(index[:1], policy, length=len(index))
+    clip = policy.reader.cut(index[:1], policy.model.world_model.percept_names, length=len(index))
     assert clip.action[0, 0, 0] == pytest.approx(
-        policy.normalise_action(torch.from_numpy(policy.reader.cache.action[index[:1]]))[0, 0].item()
+        policy.model.units.normalise_action(torch.from_numpy(policy.reader.cache.action[index[:1]]))[0, 0].item()
     )
-    margin = policy.imagination.margin(policy.world_model.encode(clip))[0]
-    row = episode_values(policy, policy.reader, np.array([2]))[0]
+    margin = policy.model.imagination.margin(policy.model.world_model.encode(clip))[0]
+    row = episode_values(policy.model, policy.reader, np.array([2]))[0]
     np.testing.assert_allclose(row["value"], margin.detach(), atol=1e-6)

@@ -12,8 +12,9 @@ from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_latentsafe.datasets.build_cache import build_frame_cache
-from lerobot_latentsafe.datasets.frame_cache import FrameCache, FrameCacheError, dataset_fingerprint, to_model_images
+from lerobot_latentsafe.datasets.frame_cache import FrameCache, FrameCacheError, dataset_fingerprint
 from lerobot_latentsafe.datasets.labels import FailureLabels
+from lerobot_latentsafe.encoders.pictures import to_model_images
 
 
 @pytest.fixture

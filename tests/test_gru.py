@@ -164,7 +164,7 @@ def test_filter_on_tokens_is_trained_saved_and_loaded(token_root, tmp_path):
     from lerobot_latentsafe.training import train_margin, train_reachability
 
     meta = tiny.metadata(token_root)
-    options = dict(world_model=tiny.gru_config(), action_candidates=None, margin_weight=0.0, margin_clips=64)
+    options = dict(world_model=tiny.gru_config(), fallback_action_candidates=None, margin_weight=0.0, margin_clips=64)
     stage_one = tiny.train_stage_one(meta, tmp_path / "one", **options)
     train_margin(stage_one, meta, tmp_path / "two")
     train_reachability(tmp_path / "two", meta, tmp_path / "three")
@@ -173,7 +173,7 @@ def test_filter_on_tokens_is_trained_saved_and_loaded(token_root, tmp_path):
     assert all(d.action.isfinite().all() and d.value.isfinite().all() for d in decisions)
     with safe_open(tmp_path / "three" / "model.safetensors", "pt") as file:
         assert not [name for name in file.keys() if "encoder" in name]  # noqa: SIM118
-    low, high = policy.critic.low, policy.critic.high
+    low, high = policy.model.critic.low, policy.model.critic.high
     for d in decisions:
-        action = policy.normalise_action(d.action)
+        action = policy.model.units.normalise_action(d.action)
         assert ((action >= low - 1e-5) & (action <= high + 1e-5))[:, 0].all()

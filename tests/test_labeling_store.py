@@ -108,7 +108,7 @@ def test_full_disk_changes_nothing(store, root, monkeypatch):
     kept = (root / "labels" / "spilled.parquet").read_bytes()
 
     def full(table, file, **options):
-        file.write(b"half a fi")
+        file.write_bytes(b"half a fi")
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(label_files.pq, "write_table", full)

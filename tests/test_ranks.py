@@ -43,8 +43,8 @@ def train_world_model(root, name):
         torch.nn.utils.clip_grad_norm_(policy.get_optim_params(), 1.0)
         optimizer.step()
         losses.append(distributed.mean_over_ranks(torch.tensor([loss.item(), metrics["loss_margin"]])))
-    assert policy.config.stage == "world_model"
-    weights = {name: w for name, w in policy.state_dict().items() if not name.startswith("critic")}
+    assert policy.config.trained_on.stage == "world_model"
+    weights = {name: w for name, w in policy.state_dict().items() if not name.startswith("model.critic")}
     return {"losses": torch.stack(losses), **weights}
 
 
@@ -52,14 +52,16 @@ def learn_reachability(root, actions):
     """Losses, weights and starts of a few updates, with batches and chunks of imagination that two do not divide."""
     torch.manual_seed(0)
     sizes = tiny.reachability_config(batch_size=33, pool=516, refresh=5)
-    policy = tiny.new_policy(tiny.metadata(root), action_candidates=ACTIONS[actions], reachability=sizes).eval()
-    policy.world_model.ends_seen.fill_(1)  # imagination that ends is started anew, on either rank
+    policy = tiny.new_policy(
+        tiny.metadata(root), fallback_action_candidates=ACTIONS[actions], reachability=sizes
+    ).eval()
+    policy.model.world_model.ends_seen.fill_(1)  # imagination that ends is started anew, on either rank
     generator = torch.Generator().manual_seed(0)
-    starts = encoded_starts(policy, policy.reader, generator)
-    learner = LatentReachability(policy.imagination, policy.critic, starts, sizes, generator)
+    starts = encoded_starts(policy.model, policy.reader, generator)
+    learner = LatentReachability(policy.model.imagination, policy.model.critic, starts, sizes, generator)
     assert learner.chunk == 129 and learner.pool["ended"].any()
     losses = torch.tensor([list(learner.update().values()) for _ in range(12)])
-    return {"losses": losses, **{f"pool {k}": v for k, v in learner.pool.items()}, **policy.critic.state_dict()}
+    return {"losses": losses, **{f"pool {k}": v for k, v in learner.pool.items()}, **policy.model.critic.state_dict()}
 
 
 def everything(car_cache, car_tokens):
@@ -141,7 +143,7 @@ def test_lerobot_train_on_two_ranks_takes_the_steps_of_one(token_root, tmp_path)
 
     assert distance(weights("one", 3), weights("two", 3)) < 1e-3 * distance(weights("one", 3), weights("one", 1))
     last = LatentSafePolicy.from_pretrained(tmp_path / "two" / "checkpoints" / "last" / "pretrained_model")
-    assert last.config.stage == "world_model"
+    assert last.config.trained_on.stage == "world_model"
 
 
 def test_train_reachability_on_two_ranks_saves_once_what_one_learns(tiny_world_model, cache_meta, tmp_path):
@@ -150,7 +152,7 @@ def test_train_reachability_on_two_ranks_saves_once_what_one_learns(tiny_world_m
         f"--dataset.repo_id={tiny.REPO_ID}", f"--dataset.root={cache_meta.root}", f"--output_dir={tmp_path / 'two'}",
     )  # fmt: skip
     assert said.count("filter with a trained critic") == 1
-    one = train_reachability(tiny_world_model, cache_meta, tmp_path / "one").critic.state_dict()
-    two = LatentSafePolicy.from_pretrained(tmp_path / "two").critic.state_dict()
+    one = train_reachability(tiny_world_model, cache_meta, tmp_path / "one").model.critic.state_dict()
+    two = LatentSafePolicy.from_pretrained(tmp_path / "two").model.critic.state_dict()
     for key, value in one.items():
         torch.testing.assert_close(two[key], value, rtol=1e-3, atol=1e-4, msg=lambda m, k=key: f"{k}: {m}")

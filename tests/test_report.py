@@ -19,7 +19,7 @@ def page(tiny_filter, tiny_diffusion, tmp_path_factory):
     path = tmp_path_factory.mktemp("report") / "deep" / "report.html"
     main(
         ["report", f"--policy.path={tiny_filter}", f"--base_policy_path={tiny_diffusion}", "--n_episodes=3",
-         "--env.type=latentsafe_dubins", "--env.episode_length=6", "--epsilon=0.3", f"--output={path}"]
+         "--env.type=latentsafe_dubins", "--env.episode_length=6", "--law.epsilon=0.3", f"--output={path}"]
     )  # fmt: skip
     return path.read_text()
 
@@ -63,9 +63,9 @@ class Still(BasePolicy):
 
 def franka_page(tmp_path, env, **changes):
     """The report on a filter of the simulated Franka that always acts, in two episodes."""
-    trained = tiny.save_franka_filter(tmp_path / "filter", scene=env.scene, epsilon=2.0, **changes)
+    trained = tiny.save_franka_filter(tmp_path / "filter", scene=env.scene, law_epsilon=2.0, **changes)
     policy = LatentSafePolicy.from_pretrained(trained).eval()
-    if perception := getattr(policy.world_model, "perception", None):
+    if perception := getattr(policy.model.world_model, "perception", None):
         perception.basis.axes.normal_(std=0.01)
         perception.basis.fitted.fill_(True)
     policy._base = [Still()]

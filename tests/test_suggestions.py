@@ -49,21 +49,23 @@ def test_contradiction_counts_labelled_frames_only():
 def test_margins_are_those_of_filtering_frame_by_frame(policy, dataset_meta, cache_root, cache_meta):
     import torch
 
-    from lerobot_latentsafe.datasets.clips import ClipReader
+    from lerobot_latentsafe.modeling_latentsafe import adopt
 
-    found = dict(episode_margins(policy, DatasetFrames(dataset_meta), batch_size=5))
+    found = dict(episode_margins(policy.model, DatasetFrames(dataset_meta), batch_size=5))
     assert sorted(found) == list(range(14))
-    reader, episode = ClipReader.of_dataset(policy.config, cache_meta), 3
+    reader, episode = adopt(policy.config, cache_meta, cache_meta.stats), 3
     index = np.flatnonzero(reader.labels.episode == episode)
     images, state = reader.cache.frames(index)
-    action = policy.normalise_action(torch.from_numpy(reader.cache.action[index]))
+    action = policy.model.units.normalise_action(torch.from_numpy(reader.cache.action[index]))
     latent, margin = None, []
     with torch.no_grad():
         for t in range(len(index)):
             frame = {k: v[t : t + 1] for k, v in images.items()}
             before = action[t - 1 : t] if t else None
-            latent = policy.world_model.observe(latent, before, frame, policy.normalise_state(state[t : t + 1]))
-            margin.append(policy.margin.bounded(policy.world_model.features(latent)).item())
+            latent = policy.model.world_model.observe(
+                latent, before, frame, policy.model.units.normalise_state(state[t : t + 1])
+            )
+            margin.append(policy.model.margin.bounded(policy.model.world_model.features(latent)).item())
     np.testing.assert_allclose(found[episode], margin, atol=1e-4)
 
 

@@ -36,7 +36,7 @@ def trained(cache_root, tmp_path_factory):
     lerobot_train(
         "--policy.type=latentsafe", "--policy.device=cpu", "--policy.push_to_hub=false",
         *(f"--policy.world_model.{name}={value}" for name, value in sizes.items()),
-        f"--policy.action_candidates={tiny.CANDIDATES}",
+        f"--policy.fallback.action_candidates={tiny.CANDIDATES}",
         f"--dataset.repo_id={tiny.REPO_ID}", f"--dataset.root={cache_root}", f"--output_dir={output_dir}",
         f"--steps={STEPS}", "--save_freq=2", "--log_freq=1", "--batch_size=8", "--num_workers=0", "--seed=1",
     )  # fmt: skip
@@ -45,14 +45,14 @@ def trained(cache_root, tmp_path_factory):
 
 def test_checkpoint_loads_as_a_world_model_without_a_critic(trained):
     policy = LatentSafePolicy.from_pretrained(checkpoint(trained, STEPS))
-    assert policy.config.stage == "world_model"
-    assert policy.config.action_candidates == tiny.CANDIDATES
-    assert policy.config.action_names == ["turn_rate.vel", "speed.vel"]
+    assert policy.config.trained_on.stage == "world_model"
+    assert policy.config.fallback.action_candidates == tiny.CANDIDATES
+    assert policy.config.trained_on.action_names == ["turn_rate.vel", "speed.vel"]
 
 
 def test_training_moved_the_weights(trained):
     before, after = (load_file(checkpoint(trained, step) / "model.safetensors") for step in (2, STEPS))
-    moved = {name.split(".")[0] for name in before if not torch.equal(before[name], after[name])}
+    moved = {name.split(".")[1] for name in before if not torch.equal(before[name], after[name])}
     assert {"world_model", "margin"} <= moved and "critic" not in moved
 
 

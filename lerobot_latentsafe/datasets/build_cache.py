@@ -11,18 +11,20 @@ import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Protocol
 
 import numpy as np
 import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-from lerobot.datasets.dataset_tools import remove_feature
+from lerobot.datasets.dataset_tools import delete_episodes, remove_feature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import ACTION, OBS_STATE
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 from tqdm import tqdm
 
+from lerobot_latentsafe._compat import drop_episode_statistics
 from lerobot_latentsafe.datasets.episodes import DatasetFrames
 from lerobot_latentsafe.datasets.frame_cache import (
     BASIS,
@@ -34,6 +36,8 @@ from lerobot_latentsafe.datasets.frame_cache import (
     basis_file,
     dataset_fingerprint,
 )
+from lerobot_latentsafe.datasets.labels import FOLDER as LABELS
+from lerobot_latentsafe.datasets.labels import Sidecar, identity, read_frames, sidecar_path, specifications_of
 from lerobot_latentsafe.encoders.perception import Perception, PerceptionConfig
 from lerobot_latentsafe.encoders.pictures import to_model_images
 from lerobot_latentsafe.runtime.files import refuse_existing, replacing
@@ -167,12 +171,13 @@ def eight_bits(tokens: Tensor) -> tuple[Tensor, Tensor]:
 
 def build_frame_cache(
     dataset: LeRobotDataset, output_dir: str | Path, image_size: int,
-    recipe: Callable[[list[str], int], Recipe] = Pictures,
+    recipe: Callable[[list[str], int], Recipe] = Pictures, episodes: list[int] | None = None,
 ) -> FrameCache | None:  # fmt: skip
     """Make a cache, or go on making it.
 
     Args:
         recipe: from cameras and image size: `Pictures`, or `Tokens` with its encoder.
+        episodes: those to keep, which are numbered anew from 0; None: all.
 
     Returns:
         The cache; None in a process that was not the last to finish.
@@ -184,29 +189,37 @@ def build_frame_cache(
     output_dir, folder = Path(output_dir), Path(output_dir) / FOLDER
     if not dataset.meta.camera_keys:
         raise FrameCacheError(f"{dataset.repo_id} has no camera; its features are {list(dataset.meta.features)}")
-    rank, world = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
+    rank = int(os.environ.get("RANK", 0))
     unfinished = (folder / LAYOUT).exists() and not (folder / MANIFEST).exists()
     if rank == 0 and not unfinished:
         refuse_existing(output_dir)
-    frames = DatasetFrames(dataset.meta)
-    see = lambda episode: _episode_images(frames, episode, image_size)  # noqa: E731
+    frames = DatasetFrames(dataset.meta, episodes)
+    see = lambda i: _episode_images(frames, frames.episodes[i], image_size)  # noqa: E731
     kept = recipe(frames.cameras, image_size)
     keep_freed_memory()
     if rank == 0 and not unfinished:
-        _lay_out(dataset, output_dir, kept, see)
-    _await_layout(dataset, folder, kept)
+        _lay_out(dataset, frames.episodes, output_dir, kept, see)
+    _await_layout(_layout(dataset, frames.episodes, kept), folder)
     kept.start(folder)
+    copy = LeRobotDatasetMetadata(f"{dataset.repo_id}_cache", root=output_dir)
+    return _finish(dataset, copy, kept) if _fill(copy, kept, see) else None
+
+
+def _fill(copy: LeRobotDatasetMetadata, kept: Recipe, see: See) -> bool:
+    """Perceive this process's share of the episodes; whether all processes have done theirs."""
+    rank, world = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
+    folder = Path(copy.root) / FOLDER
     arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r+") for name in kept.arrays}
     done = np.load(folder / DONE, mmap_mode="r+")
-    mine = [e for e in range(rank, dataset.num_episodes, world) if not done[e]]
+    mine = [e for e in range(rank, copy.total_episodes, world) if not done[e]]
     for episode in tqdm(mine, desc="decoding episodes", unit="episode", disable=rank > 0):
-        first = dataset.meta.episodes[episode]["dataset_from_index"]
+        first = copy.episodes[episode]["dataset_from_index"]
         for name, values in kept.perceive(see(episode)).items():
             arrays[name][first : first + len(values)] = values
             arrays[name].flush()
         done[episode] = True
         done.flush()
-    return _finish(dataset, output_dir, kept) if done.all() else None
+    return bool(done.all())
 
 
 def _episode_images(frames: DatasetFrames, episode: int, image_size: int) -> dict[str, Tensor]:
@@ -217,50 +230,77 @@ def _episode_images(frames: DatasetFrames, episode: int, image_size: int) -> dic
     return images
 
 
-def _layout(dataset: LeRobotDataset, kept: Recipe) -> dict:
+def _layout(dataset: LeRobotDataset, episodes: list[int], kept: Recipe) -> list:
     """Tells whether an unfinished cache is of the same thing."""
-    return json.loads(json.dumps([dataset_fingerprint(dataset.meta), kept.arrays, kept.manifest]))
+    some = [episodes] if len(episodes) < dataset.num_episodes else []
+    return json.loads(json.dumps([dataset_fingerprint(dataset.meta), kept.arrays, kept.manifest, *some]))
 
 
-def _lay_out(dataset: LeRobotDataset, output_dir: Path, kept: Recipe, see: See) -> None:
+def _lay_out(dataset: LeRobotDataset, episodes: list[int], output_dir: Path, kept: Recipe, see: See) -> None:
     """Copy the dataset without images and make room for all frames; output_dir appears when that is done."""
     begun = output_dir.with_name(f"{output_dir.name}.begun")
-    folder, n = begun / FOLDER, dataset.num_frames
     shutil.rmtree(begun, ignore_errors=True)
-    cameras = list(dataset.meta.camera_keys)
-    copy = remove_feature(dataset, cameras, output_dir=begun, repo_id=f"{dataset.repo_id}_cache")
-    if (Path(dataset.root) / "labels").exists():
-        shutil.copytree(Path(dataset.root) / "labels", begun / "labels")
+    copy = _without_cameras(dataset, episodes, begun)
+    _copy_labels(dataset, episodes, begun)
+    folder, n = begun / FOLDER, copy.num_frames
     folder.mkdir()
     columns = copy.hf_dataset.with_format("numpy")
     np.save(folder / "state.npy", np.asarray(columns[OBS_STATE], np.float32).reshape(n, -1))
     np.save(folder / "action.npy", np.asarray(columns[ACTION], np.float32).reshape(n, -1))
     for name, (shape, dtype) in kept.arrays.items():
         np.lib.format.open_memmap(folder / f"{name}.npy", mode="w+", dtype=dtype, shape=(n, *shape))
-    np.save(folder / DONE, np.zeros(dataset.num_episodes, bool))
-    kept.prepare(folder, see, dataset.num_episodes)
-    _write(folder / LAYOUT, _layout(dataset, kept))
+    np.save(folder / DONE, np.zeros(copy.num_episodes, bool))
+    kept.prepare(folder, see, copy.num_episodes)
+    _write(folder / LAYOUT, _layout(dataset, episodes, kept))
     begun.rename(output_dir)
 
 
-def _await_layout(dataset: LeRobotDataset, folder: Path, kept: Recipe, patience_s: float = 600) -> None:
-    """Wait until the first process has laid the cache out, and check that it is this one."""
+def _without_cameras(dataset: LeRobotDataset, episodes: list[int], folder: Path) -> LeRobotDataset:
+    """A copy of these episodes without pictures."""
+    cameras, repo_id = list(dataset.meta.camera_keys), f"{dataset.repo_id}_cache"
+    others = sorted({*range(dataset.num_episodes)} - {*episodes})
+    if not others:
+        return remove_feature(dataset, cameras, output_dir=folder, repo_id=repo_id)
+    with TemporaryDirectory(dir=folder.parent) as temporary:
+        bare = remove_feature(dataset, cameras, output_dir=Path(temporary) / "bare", repo_id=repo_id)
+        drop_episode_statistics(bare.root, cameras)
+        return delete_episodes(bare, others, output_dir=folder, repo_id=repo_id)
+
+
+def _copy_labels(dataset: LeRobotDataset, episodes: list[int], folder: Path) -> None:
+    """The label files of these episodes for the copy of a dataset."""
+    labels = Path(dataset.root) / LABELS
+    if len(episodes) == dataset.num_episodes and labels.exists():
+        shutil.copytree(labels, folder / LABELS)
+        return
+    frames, kept = (read_frames(root, ["action"]) for root in (dataset.root, folder))
+    rows, n = np.isin(frames["episode_index"], episodes), len(kept["index"])
+    for name in specifications_of(dataset.root):
+        path = sidecar_path(folder, name)
+        path.parent.mkdir(exist_ok=True)
+        whole = Sidecar.read(sidecar_path(dataset.root, name), frames)
+        part = Sidecar(whole.failure[rows], whole.by[rows], whole.at[rows], whole.names)
+        part.write(path, dataset.repo_id, identity(kept, n))
+
+
+def _await_layout(expected: list, folder: Path, patience_s: float = 600) -> None:
+    """Wait until the first process has laid the cache out, and check that it is the one that is expected."""
     given_up = time.monotonic() + patience_s
     while not (folder / LAYOUT).exists():
         if time.monotonic() > given_up:
             raise FrameCacheError(f"{folder} was not laid out within {patience_s:.0f} s; did the first process stop?")
         time.sleep(0.1)
-    if json.loads((folder / LAYOUT).read_text()) != _layout(dataset, kept):
+    if json.loads((folder / LAYOUT).read_text()) != expected:
         raise FileExistsError(
             f"{folder} holds an unfinished cache of another dataset, size or encoder; choose another --output_dir or "
             "delete it"
         )
 
 
-def _finish(dataset: LeRobotDataset, output_dir: Path, kept: Recipe) -> FrameCache:
+def _finish(dataset: LeRobotDataset, copy: LeRobotDatasetMetadata, kept: Recipe) -> FrameCache:
     cameras = {key: list(dataset.meta.features[key]["shape"]) for key in dataset.meta.camera_keys}
-    write_manifest(output_dir, dataset.meta, cameras, kept.manifest)
-    return FrameCache.open(output_dir, LeRobotDatasetMetadata(f"{dataset.repo_id}_cache", root=output_dir))
+    write_manifest(Path(copy.root), copy, cameras, {**kept.manifest, "repo_id": dataset.repo_id})
+    return FrameCache.open(copy.root, copy)
 
 
 def write_manifest(root: Path, meta: LeRobotDatasetMetadata, cameras: dict[str, list[int]], percepts: dict) -> None:

@@ -15,13 +15,21 @@ MAX_HEIGHT = 480
 class DatasetFrames:
     """Reads episodes from a dataset's own files, video or images, without decoding anything else.
 
+    Args:
+        meta: of the dataset.
+        episodes: those that are meant; None: all.
+
+    Attributes:
+        episodes: their numbers, in order.
+
     Raises:
         ValueError: the dataset has no camera.
         FileNotFoundError: a file of an episode is missing.
     """
 
-    def __init__(self, meta: LeRobotDatasetMetadata):
+    def __init__(self, meta: LeRobotDatasetMetadata, episodes: list[int] | None = None):
         self.meta, self.root = meta, Path(meta.root)
+        self.episodes = sorted({*range(meta.total_episodes)} if episodes is None else {*episodes})
         self.cameras = [k for k in meta.camera_keys if k not in meta.depth_keys]
         if not self.cameras:
             raise ValueError(
@@ -32,7 +40,7 @@ class DatasetFrames:
 
     def _check_files(self) -> None:
         files = {}
-        for episode in range(self.meta.total_episodes):
+        for episode in self.episodes:
             files.setdefault(self.root / self.meta.get_data_file_path(episode), episode)
             for camera in set(self.cameras) & set(self.meta.video_keys):
                 files.setdefault(self.root / self.meta.get_video_file_path(episode, camera), episode)

@@ -57,15 +57,14 @@ def values_along(model: SafetyModel, frames: DatasetFrames, episode: int) -> Epi
 def episode_margins(
     model: SafetyModel, frames: DatasetFrames, batch_size: int = 16
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """Margins (T,) along every episode, filtered from its first frame: (episode, margin) in order.
+    """Margins (T,) along every episode that is meant, filtered from its first frame: (episode, margin) in order.
 
     Raises:
         ValueError: the dataset is of another robot, rate or camera than the filter's.
     """
     check_fit(model, frames)
-    episodes = range(frames.meta.total_episodes)
-    for first in episodes[::batch_size]:
-        batch = list(episodes[first : first + batch_size])
+    for first in range(0, len(frames.episodes), batch_size):
+        batch = frames.episodes[first : first + batch_size]
         latents, length = encode_episodes(model, frames, batch)
         margin = model.imagination.margin(latents).detach().cpu().numpy()
         yield from zip(batch, (row[:n] for row, n in zip(margin, length)))

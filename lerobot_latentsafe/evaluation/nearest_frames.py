@@ -43,9 +43,10 @@ class NearestFrames:
             ValueError: it was recorded with another robot, rate or camera than the filter's.
         """
         check_fit(self.model, frames)
-        total = frames.meta.total_episodes
-        step = -(-min(EPISODES, total) * frames.meta.total_frames // (total * FRAMES))
-        for episode in np.unique(np.linspace(0, total - 1, min(EPISODES, total)).round().astype(int)).tolist():
+        total = len(frames.episodes)
+        step = -(-min(EPISODES, total) * frames.meta.total_frames // (frames.meta.total_episodes * FRAMES))
+        places = np.unique(np.linspace(0, total - 1, min(EPISODES, total)).round().astype(int))
+        for episode in np.array(frames.episodes)[places].tolist():
             images = {key: frames.images(key, episode)[::step] for key in self.model.world_model.image_keys}
             state = torch.from_numpy(frames.columns(episode, ["observation.state"])["observation.state"][::step])
             tensors = {key: torch.from_numpy(i).permute(0, 3, 1, 2).contiguous() for key, i in images.items()}

@@ -186,12 +186,12 @@ def find_labeller(name: str) -> Labeller:
 def label_automatically(
     store: LabelStore, frames: DatasetFrames, specification: str, labeller: Labeller, name: str
 ) -> dict[str, list]:
-    """Ask a labeller about every episode that has no label yet, and save what it says; people's labels stay.
+    """Ask a labeller about the episodes of `frames` that have no label yet, and save what it says.
 
     Returns:
         labelled: episodes; undecided: episodes; refused: (episode, why) of answers that were no labels.
     """
-    open_episodes = [e for e in range(len(store)) if (store.labels(specification, e) == UNLABELLED).all()]
+    open_episodes = [e for e in frames.episodes if (store.labels(specification, e) == UNLABELLED).all()]
     found, result = {}, {"labelled": [], "undecided": [], "refused": []}
     for number in tqdm(open_episodes, desc=name, unit="episode"):
         length = int(store.length[number])

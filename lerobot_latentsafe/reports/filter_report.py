@@ -173,13 +173,14 @@ def _recording(
     parts = [
         html.heading("Recorded under the filter"),
         html.paragraph(
-            f"{recording.frames.meta.repo_id}: {len(acted)} episodes; the filter acted in {(acted > 0).sum()} of them, "
-            f"and in {acted.sum() / steps.sum():.1%} of all steps."
+            f"{recording.frames.meta.repo_id}: {(steps > 0).sum()} episodes; the filter acted in "
+            f"{(acted > 0).sum()} of them, and in {acted.sum() / steps.sum():.1%} of all steps."
         ),
         html.table(["why a step was judged as it was", "steps"], list(count_reasons(decisions["reason"]).items())),
         html.paragraph("The episodes in which it acted most; an orange frame while it acts. " + CURVES),
     ]
-    for i in np.argsort(-acted, kind="stable")[:SHOWN].tolist():
+    most = [i for i in np.argsort(-acted, kind="stable").tolist() if steps[i]][:SHOWN]
+    for i in most:
         parts.append(f"<h3>Episode {i}: the filter acts in {acted[i]} of {steps[i]} steps</h3>")
         parts += _played({"recorded": recording.read(i)}, policy, fps, folder / f"recorded_{i}", seen)
     return parts

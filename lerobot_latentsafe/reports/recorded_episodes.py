@@ -12,7 +12,7 @@ from lerobot_latentsafe.safety_model import SafetyModel
 
 
 class RecordedEpisodes:
-    """A dataset with the shield's decisions beside it.
+    """A dataset with the shield's decisions beside it, or some episodes of one.
 
     Attributes:
         episode: (N,) of each frame.
@@ -27,6 +27,8 @@ class RecordedEpisodes:
         check_fit(model, frames)
         self.model, self.frames = model, frames
         stored = read_frames(frames.root, ["frame_index", "action"])
+        meant = np.isin(stored["episode_index"], frames.episodes)
+        stored = {name: column[meant] for name, column in stored.items()}
         self.episode, self.executed = stored["episode_index"], stored["action"]
         self.decisions = decision_columns(frames.root / FILE, stored)
 
