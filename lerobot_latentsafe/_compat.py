@@ -3,7 +3,10 @@
 import logging
 import re
 from collections import deque
+from pathlib import Path
 from typing import TYPE_CHECKING
+
+import pyarrow.parquet as pq
 
 if TYPE_CHECKING:
     from lerobot.configs.policies import PreTrainedConfig
@@ -23,6 +26,17 @@ NOT_AVERAGED = "_ddp_params_and_buffers_to_ignore"
 def quiet_decoder() -> None:
     """torchcodec without system FFmpeg logs a page of traceback; LeRobot then falls back to pyav by itself."""
     logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
+
+
+def drop_episode_statistics(root: Path, features: list[str]) -> None:
+    """Remove what a dataset's episodes still say of features that `remove_feature` took out.
+
+    LeRobot leaves their statistics there, and then refuses to aggregate those of pictures.
+    """
+    for file in root.glob("meta/episodes/*/*.parquet"):
+        table = pq.read_table(file)
+        left_over = tuple(f"stats/{feature}/" for feature in features)
+        pq.write_table(table.drop_columns([c for c in table.column_names if c.startswith(left_over)]), file)
 
 
 def queued_actions(policy: "PreTrainedPolicy") -> deque | None:
