@@ -1,79 +1,124 @@
-"""`latentsafe <verb> --a.b=c`: LeRobot-style options, one dataclass a verb."""
+"""`latentsafe <verb> --a.b=c`: LeRobot-style options, one dataclass a verb.
 
+Importing this loads neither LeRobot nor a model; `main` imports the verb that is asked for.
+"""
+
+import difflib
 import importlib
 import logging
 import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
 
-VERBS: dict[str, tuple[str, str]] = {
-    "collect": ("Collect", "record labelled episodes of a simulated task as a LeRobotDataset"),
-    "cache": ("Cache", "decode a dataset's frames once, so that training does not have to"),
-    "eval-world-model": ("EvalWorldModel", "ask a world model whether it obeys the action and looks"),
-    "train-margin": ("TrainMargin", "fit the failure margin to labels on a frozen world model"),
-    "train-reachability": (
-        "TrainReachability",
-        "learn the safety value and the fallback in a world model's imagination",
-    ),
-    "train-dreamer": ("baselines.dreamer.training.TrainDreamer", "learn the blocks' task policy in imagination"),
-    "calibrate": ("Calibrate", "choose epsilon on held-out episodes and store the evidence"),
-    "wrap": ("Wrap", "write a filter and the policy it shields as one self-contained folder"),
-    "push": ("Push", "push a filter, or a shielded policy, to the Hub with its card"),
-    "eval-monitor": ("EvalMonitor", "compare a filter's verdicts with the exact safe set (Table 1)"),
-    "eval-shield": ("EvalShield", "run a policy bare and shielded from the same starts"),
-    "record": ("recording.Record", "lerobot-record under a filter: the dataset stores what was executed"),
-    "teleoperate": ("recording.Teleoperate", "lerobot-teleoperate under a filter"),
-    "merge-decisions": ("MergeDecisions", "copy a recording with the shield's decisions as columns"),
-    "label": ("Label", "open a local page on which a person marks where episodes fail"),
-    "check-labels": ("CheckLabels", "list the labels that a trained filter disagrees with"),
-    "auto-label": ("AutoLabel", "let a function or a vision-language model label the rest"),
-    "write-labels": ("WriteLabels", "copy a dataset with its labels as columns, and push it on request"),
-    "picture-features": ("PictureFeatures", "draw what an encoder makes of the bag's variants"),
-    "report": ("Report", "write one HTML file about a filter and what it changes"),
-    "path": ("PathOf", "print the folder of a committed checkpoint, for LeRobot's commands"),
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Verb:
+    """A verb of the console command.
+
+    Attributes:
+        group: what it helps with; see GROUPS.
+        module, name: where its options class is, which has a method `run`.
+        what: what it is for.
+    """
+
+    group: str
+    module: str
+    name: str
+    what: str
+
+
+GROUPS = {
+    "record": "record episodes",
+    "label": "say where episodes fail",
+    "train": "make a filter of them",
+    "deploy": "use it",
+    "evaluate": "ask what it is worth",
 }
-"""Verb -> its dataclass, in `commands.py` unless a module is named, and what it is for."""
+_RECORD, _LABEL, _TRAIN, _DEPLOY, _EVALUATE = (f"lerobot_latentsafe.cli.{group}" for group in GROUPS)
+_DREAMER = "lerobot_latentsafe.experiments.blocks.dreamer_training"
+
+VERBS: dict[str, Verb] = {
+    "collect": Verb("record", _RECORD, "Collect", "record labelled episodes of a simulated task as a LeRobotDataset"),
+    "record": Verb("record", _RECORD, "Record", "lerobot-record under a filter: the dataset stores what was executed"),
+    "teleoperate": Verb("record", _RECORD, "Teleoperate", "lerobot-teleoperate under a filter"),
+    "merge-decisions": Verb(
+        "record", _RECORD, "MergeDecisions", "copy a recording with the shield's decisions as columns"
+    ),
+    "label": Verb("label", _LABEL, "Label", "open a local page on which a person marks where episodes fail"),
+    "auto-label": Verb("label", _LABEL, "AutoLabel", "let a function or a vision-language model label the rest"),
+    "check-labels": Verb("label", _LABEL, "CheckLabels", "list the labels that a trained filter disagrees with"),
+    "write-labels": Verb(
+        "label", _LABEL, "WriteLabels", "copy a dataset with its labels as columns, and push it on request"
+    ),
+    "cache": Verb("train", _TRAIN, "Cache", "decode a dataset's frames once, so that training does not have to"),
+    "train-margin": Verb("train", _TRAIN, "TrainMargin", "fit the failure margin to labels on a frozen world model"),
+    "train-reachability": Verb(
+        "train", _TRAIN, "TrainReachability", "learn the safety value and the fallback in a world model's imagination"
+    ),
+    "train-dreamer": Verb("train", _DREAMER, "TrainDreamer", "learn the blocks' task policy in imagination"),
+    "calibrate": Verb("train", _TRAIN, "Calibrate", "choose epsilon on held-out episodes and store the evidence"),
+    "wrap": Verb("deploy", _DEPLOY, "Wrap", "write a filter and the policy it shields as one self-contained folder"),
+    "push": Verb("deploy", _DEPLOY, "Push", "push a filter, or a shielded policy, to the Hub with its card"),
+    "path": Verb("deploy", _DEPLOY, "PathOf", "print the folder of a committed checkpoint, for LeRobot's commands"),
+    "migrate-checkpoint": Verb(
+        "deploy", _DEPLOY, "MigrateCheckpoint", "copy a checkpoint of a version before 0.2 into the present layout"
+    ),
+    "eval-monitor": Verb(
+        "evaluate", _EVALUATE, "EvalMonitor", "compare a filter's verdicts with the exact safe set (Table 1)"
+    ),
+    "eval-shield": Verb("evaluate", _EVALUATE, "EvalShield", "run a policy bare and shielded from the same starts"),
+    "eval-world-model": Verb(
+        "evaluate", _EVALUATE, "EvalWorldModel", "ask a world model whether it obeys the action and looks"
+    ),
+    "report": Verb("evaluate", _EVALUATE, "Report", "write one HTML file about a filter and what it changes"),
+    "draw-features": Verb("evaluate", _EVALUATE, "DrawFeatures", "draw what an encoder makes of the bag's variants"),
+}
+RENAMED_VERBS = {"picture-features": "draw-features"}
+"""Old name -> present name."""
 
 INTRODUCTION = """Latent safety filters for LeRobot.
 
-usage: latentsafe <verb> [--option=value ...]      latentsafe <verb> --help shows a verb's options
+usage: latentsafe <verb> [--option=value ...]      latentsafe <verb> --help shows an example and all options
 
 From episodes to a shielded policy:
-  1. latentsafe collect --source=random --repo_id=me/car --root=data/car    (or record with lerobot-record)
+  1. latentsafe collect --source=random --dataset.repo_id=me/car --dataset.root=data/car    (or lerobot-record)
   2. latentsafe cache --dataset.repo_id=me/car --dataset.root=data/car --output_dir=data/car_cache
   3. lerobot-train --policy.type=latentsafe --dataset.repo_id=me/car_cache --dataset.root=data/car_cache ...
   4. latentsafe train-reachability --policy.path=<checkpoint> --dataset.root=data/car_cache --output_dir=filter
   5. latentsafe eval-shield --policy.path=filter --base_policy_path=<your policy> --env.type=latentsafe_dubins ...
+"""
 
-verbs:"""
+
+def overview() -> str:
+    """What `latentsafe --help` prints: the verbs in groups."""
+    lines = [INTRODUCTION]
+    for group, title in GROUPS.items():
+        lines.append(f"{group}: {title}")
+        lines += [f"  {verb:20s} {entry.what}" for verb, entry in VERBS.items() if entry.group == group]
+        lines.append("")
+    return "\n".join(lines)
+
+
+def nearest(name: str, known: Iterable[str]) -> str | None:
+    """What was probably meant, if anything known resembles it."""
+    return next(iter(difflib.get_close_matches(name, list(known), n=1)), None)
 
 
 def main(argv: list[str] | None = None) -> None:
     """Entry point of the console command `latentsafe`."""
-    argv = sys.argv[1:] if argv is None else argv
-    if not argv or argv[0] in ("-h", "--help", "help"):
-        print(INTRODUCTION)
-        for verb, (_, what) in VERBS.items():
-            print(f"  {verb:20s} {what}")
-        return
-    verb, *options = argv
+    verb, *options = (sys.argv[1:] if argv is None else argv) or ["--help"]
+    if verb in ("-h", "--help", "help"):
+        if not options:
+            return print(overview())
+        verb, options = options[0], ["--help"]  # latentsafe help <verb>
+    logging.basicConfig(format="%(levelname)s %(message)s")
+    if verb in RENAMED_VERBS:
+        logger.warning("latentsafe %s is now latentsafe %s", verb, RENAMED_VERBS[verb])
+        verb = RENAMED_VERBS[verb]
     if verb not in VERBS:
-        sys.exit(f"latentsafe: unknown verb {verb!r}; expected one of {', '.join(VERBS)}")
-    # torchcodec without system FFmpeg logs a page of traceback; LeRobot then falls back to pyav by itself.
-    logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
-    module, _, name = VERBS[verb][0].rpartition(".")
-    command = getattr(importlib.import_module(f"lerobot_latentsafe.{module or 'commands'}"), name)
-
-    import draccus
-    from lerobot.utils.import_utils import register_third_party_plugins
-
-    register_third_party_plugins()
-    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(message)s")
-    try:
-        draccus.parse(command, args=options).run()
-    except draccus.utils.DecodingError as e:
-        sys.exit(f"latentsafe {verb}: {e}")
-    except (ValueError, OSError, RuntimeError, ImportError, KeyError) as e:
-        sys.exit(f"latentsafe {verb}: {e.args[0] if isinstance(e, KeyError) else e}")
-
-
-if __name__ == "__main__":
-    main()
+        meant = nearest(verb, VERBS)
+        hint = f"did you mean {meant}? latentsafe --help lists all" if meant else f"expected one of {', '.join(VERBS)}"
+        sys.exit(f"latentsafe: unknown verb {verb!r}; {hint}")
+    importlib.import_module("lerobot_latentsafe.cli.command_line").run(verb, VERBS[verb], options)

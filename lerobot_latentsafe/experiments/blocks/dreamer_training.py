@@ -38,6 +38,8 @@ OPTIONS, LOG = "options.json", "log.jsonl"
 class TrainDreamer:
     """Learn the blocks' task policy, with its world model and failure margin, from demonstrations and its own episodes.
 
+    latentsafe train-dreamer --config_path=configs/blocks_dreamer.yaml --output_dir=outputs/dreamer
+
     A killed run goes on if it is started again. Afterwards <output_dir>/policy is the task policy, <output_dir>/policy/
     world_model what `latentsafe train-reachability` takes as --policy.path, and <output_dir>/episodes the dataset that
     goes with it.

@@ -1,0 +1,154 @@
+"""Verbs that label: by a person on a page, by a function or a model, and what to do with labels."""
+
+import getpass
+import os
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+
+from lerobot_latentsafe.cli.options import DatasetSource, DefaultPolicySource, OptionalPolicySource
+from lerobot_latentsafe.datasets.columns import push_dataset, write_columns
+from lerobot_latentsafe.evaluation.along_episodes import episode_margins
+from lerobot_latentsafe.labeling import automatic
+from lerobot_latentsafe.labeling.disagreements import find_disagreements, in_words, write_disagreements
+from lerobot_latentsafe.labeling.store import LabelStore
+from lerobot_latentsafe.labeling.suggestions import Suggester
+from lerobot_latentsafe.modeling_latentsafe import load_filter
+
+
+@dataclass
+class Label:
+    """Open a local page on which a person marks where episodes fail; every key is saved beside the dataset.
+
+    latentsafe label --dataset.repo_id=me/bag --dataset.root=data/bag
+
+    With --policy.path, a trained filter draws its margin, guesses, and puts the most useful episodes first.
+    """
+
+    dataset: DatasetSource = field(default_factory=DatasetSource)
+    policy: OptionalPolicySource = field(default_factory=OptionalPolicySource)
+    specifications: list[str] = field(default_factory=lambda: ["failure"])
+    """What can fail: each name gets labels of its own; those that have a label file are offered anyway."""
+    user: str = field(default_factory=getpass.getuser)
+    """Who labels; kept with each label."""
+    host: str = "127.0.0.1"
+    """The address to listen at."""
+    port: int = 8765
+    """0 takes a free one."""
+
+    def run(self) -> None:
+        """Serve the page until interrupted."""
+        if not (find_spec("starlette") and find_spec("uvicorn")):
+            raise ImportError("the page needs starlette and uvicorn: pip install 'lerobot_policy_latentsafe[label]'")
+        from lerobot_latentsafe.labeling.app import LabelServer, listen, serve  # an optional dependency
+
+        self.dataset.require_whole("the page", "leave it out: the page shows all episodes, and unlabelled ones first")
+        frames = self.dataset.frames()
+        store = LabelStore(frames.root, frames.meta.repo_id, self.specifications)
+        server = LabelServer(store, frames, self.user)
+        listener = listen(self.host, self.port)
+        if self.policy.path:
+            server.suggester = Suggester(self.policy.path, frames.meta.repo_id, frames.root, server.suggestion_arrived)
+        serve(server, listener)
+
+
+@dataclass
+class AutoLabel:
+    """Let a function label the episodes that have no label yet; labels people gave stay.
+
+    latentsafe auto-label --labeller=my_module:my_function --dataset.repo_id=me/bag --dataset.root=data/bag
+
+    Labellers: dubins_truth (the car's recorded position), module:function (your own, see labeling/automatic.py), and
+    vision_language, which asks the model at --url about --failure and takes well-formed answers only. A service's key
+    is read from the environment variable LATENTSAFE_MODEL_KEY.
+    """
+
+    labeller: str
+    """Who labels; see above."""
+    dataset: DatasetSource = field(default_factory=DatasetSource)
+    specification: str = "failure"
+    """The name of the labels."""
+    failure: str | None = None
+    """What counts as a failure, in words, for vision_language."""
+    url: str = "http://127.0.0.1:8000/v1"
+    """Where the model of vision_language answers, in the protocol of OpenAI's chat."""
+    model: str = "default"
+    """What it is called there."""
+
+    def run(self) -> None:
+        """Label, and say how many."""
+        labeller = self._find()
+        frames = self.dataset.frames()
+        store = LabelStore(frames.root, frames.meta.repo_id, [self.specification])
+        result = automatic.label_automatically(store, frames, self.specification, labeller, self.labeller)
+        for name, episodes in result.items():
+            print(f"{name:10s} {len(episodes)} episodes")
+        for episode, why in result["refused"][:10]:
+            print(f"episode {episode}: {why}")
+
+    def _find(self) -> automatic.Labeller:
+        if self.labeller != "vision_language":
+            return automatic.find_labeller(self.labeller)
+        if not self.failure:
+            raise ValueError("vision_language needs --failure: what counts as one, such as 'a candy left the bag'")
+        endpoint = automatic.ChatEndpoint(self.url, self.model, os.environ.get("LATENTSAFE_MODEL_KEY"))
+        return automatic.VisionLanguageLabeller(endpoint, self.failure)
+
+
+@dataclass
+class CheckLabels:
+    """List the labelled episodes that a trained filter disagrees with, the worst first, on one HTML page.
+
+    latentsafe check-labels --policy.path=outputs/filter --dataset.repo_id=me/bag --dataset.root=data/bag
+    """
+
+    policy: DefaultPolicySource = field(default_factory=DefaultPolicySource)
+    dataset: DatasetSource = field(default_factory=DatasetSource)
+    specification: str = "failure"
+    """The name of the labels."""
+    output: Path = Path("outputs/disagreements.html")
+    """The page to write."""
+
+    def run(self) -> None:
+        """Write the page, and print the worst."""
+        frames = self.dataset.frames()
+        store = LabelStore(frames.root, frames.meta.repo_id, [self.specification])
+        margins = dict(episode_margins(load_filter(self.policy.path).model, frames))
+        found = find_disagreements(store, self.specification, margins)
+        for d in found[:20]:
+            label = in_words(store.verdict(self.specification, d.episode).first, len(d.margin))
+            print(f"episode {d.episode:5d}  {d.degree:.2f}  labelled: {label}")
+        write_disagreements(self.output, found, store, frames, self.specification)
+        print(f"{len(found)} disagreements; open {self.output}")
+
+
+@dataclass
+class WriteLabels:
+    """Copy a dataset with its label files as columns, which LeRobot alone can read, and push it on request.
+
+    latentsafe write-labels --dataset.repo_id=me/bag --dataset.root=data/bag --new_repo_id=me/bag_labelled \\
+      --output_dir=data/bag_labelled
+    """
+
+    output_dir: Path
+    """The folder to write."""
+    new_repo_id: str
+    """The id of the copy."""
+    dataset: DatasetSource = field(default_factory=DatasetSource)
+    specifications: list[str] = field(default_factory=lambda: ["failure"])
+    """The names of the labels that become columns."""
+    push_to_hub: bool = False
+    """Push the copy to the Hub."""
+    private: bool = False
+    """In a repository that only you see."""
+
+    def run(self) -> None:
+        """Write the copy, and push it if asked to."""
+        self.dataset.require_whole(
+            "write-labels", "leave it out, and delete episodes of the copy with LeRobot's lerobot-edit-dataset"
+        )
+        written = write_columns(self.dataset.opened(), self.specifications, self.output_dir, self.new_repo_id)
+        print(f"{written.num_frames} frames with the columns {', '.join(self.specifications)} in {self.output_dir}")
+        if self.push_to_hub:
+            push_dataset(written, self.private)
+            print(f"pushed to {self.new_repo_id}")
