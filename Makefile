@@ -1,5 +1,5 @@
 # Two commands do everything on a fresh machine, set-up included: `make demo` and `make test`.
-.PHONY: setup demo demo-bag test lint results
+.PHONY: setup demo demo-bag test lint docs platforms results
 
 PYTHON = .venv/bin/python
 # Tests and commands start many processes: without kept bytecode each would compile all that it imports.
@@ -15,15 +15,31 @@ demo: setup
 # make demo-bag POLICY=<filter> BASE=<policy>
 POLICY ?= bag
 BASE ?= bag_diffusion_weak
+# Linux draws without a display by EGL; a Mac has its own way and refuses the name.
+ifeq ($(shell uname -s),Linux)
+demo-bag: export MUJOCO_GL ?= egl
+endif
 demo-bag: setup
-	MUJOCO_GL=$${MUJOCO_GL:-egl} $(PYTHON) scripts/demo_bag.py --policy="$(POLICY)" $(if $(BASE),--base="$(BASE)")
+	$(PYTHON) scripts/demo_bag.py --policy="$(POLICY)" $(if $(BASE),--base="$(BASE)")
 
 test: lint
-	HF_HUB_OFFLINE=1 $(PYTHON) -m pytest
+	HF_HUB_OFFLINE=1 $(PYTHON) -m pytest -n logical --maxprocesses 4
+	$(PYTHON) scripts/fill_results.py --check
 
 lint: setup
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
+	.venv/bin/lint-imports --no-logo
+	.venv/bin/mypy
+	.venv/bin/interrogate lerobot_latentsafe
+
+# The pages, with the notebook executed, into docs/_build/html.
+docs: setup
+	HF_HUB_OFFLINE=1 .venv/bin/sphinx-build -W --keep-going -q -b html docs docs/_build/html
+
+# Can requirements.lock be installed on each platform? Asks the package index.
+platforms: setup
+	scripts/check_platforms.sh
 
 results: setup
 	scripts/reproduce_dubins.sh
