@@ -12,6 +12,8 @@ os.environ["TOKENIZERS_PARALLELISM"] = "false"
 
 import logging
 import shutil
+import threading
+import time
 
 import pytest
 import tiny
@@ -25,6 +27,37 @@ logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
 @pytest.fixture(autouse=True)
 def seeded():
     torch.manual_seed(0)
+
+
+class VirtualTime:
+    """Time that passes while the test's thread sleeps, at once, and not while it computes: no machine is too slow."""
+
+    def __init__(self):
+        self.now, self.thread, self.wait = 1000.0, threading.get_ident(), time.sleep
+
+    def perf_counter(self) -> float:
+        """Seconds; a look takes a microsecond, so that a loop that waits for a time ends."""
+        self.sleep(1e-6)
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        """Let time pass; other threads wait in earnest."""
+        if threading.get_ident() == self.thread:
+            self.now += seconds
+        else:
+            self.wait(seconds)
+
+
+@pytest.fixture
+def virtual_time(monkeypatch):
+    """The clock of LeRobot's loops, of a shielded robot and of its filter."""
+    from lerobot_latentsafe.shield import Shield
+
+    clock, make = VirtualTime(), Shield.__init__
+    monkeypatch.setattr(time, "perf_counter", clock.perf_counter)
+    monkeypatch.setattr(time, "sleep", clock.sleep)
+    monkeypatch.setattr(Shield, "__init__", lambda self, filter, clock=clock.perf_counter: make(self, filter, clock))
+    return clock
 
 
 @pytest.fixture(scope="session")

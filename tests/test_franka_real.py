@@ -3,6 +3,7 @@
 import logging
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,9 +11,10 @@ from lerobot.robots.utils import make_robot_from_config
 from lerobot.utils.errors import DeviceNotConnectedError
 
 from lerobot_latentsafe.franka.actions import ACTION_NAMES, GRIPPER_WIDTH, HOME, JOINT_NAMES, STATE_NAMES
+from lerobot_latentsafe.robots.franka import franka
 from lerobot_latentsafe.robots.franka.config_franka import LatentSafeFrankaConfig
 from lerobot_latentsafe.robots.franka.driver import ArmState, FrankaError, FrankyDriver, GripperError
-from lerobot_latentsafe.robots.franka.franka import DOWN, LatentSafeFranka
+from lerobot_latentsafe.robots.franka.franka import DOWN, STREAM_HZ, LatentSafeFranka
 
 STILL = dict.fromkeys(ACTION_NAMES, 0.0) | {"gripper.pos": 1.0}
 START = np.array([0.45, 0.0, 0.30])
@@ -81,7 +83,21 @@ def make(driver=None, **options):
 
 
 @pytest.fixture
-def robot():
+def clock(monkeypatch):
+    """The robot's clock. It stands, so that no test is too slow for it; once it `runs`, each streamed pose moves it."""
+    clock, track = SimpleNamespace(now=0.0, runs=False, monotonic=lambda: clock.now), FakeDriver.track
+
+    def timed(self, position, rotation):
+        clock.now += clock.runs / STREAM_HZ
+        track(self, position, rotation)
+
+    monkeypatch.setattr(FakeDriver, "track", timed)
+    monkeypatch.setattr(franka, "time", clock)
+    return clock
+
+
+@pytest.fixture
+def robot(clock):
     made = make()
     made.connect()
     yield made
@@ -90,7 +106,7 @@ def robot():
         made.disconnect()
 
 
-def wait_for(condition, seconds=2.0):
+def wait_for(condition, seconds=60.0):
     until = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < until, "did not happen in time"
@@ -106,7 +122,8 @@ def test_features_are_the_simulations(robot):
     )
 
 
-def test_a_delta_is_streamed_smoothly(robot):
+def test_a_delta_is_streamed_smoothly(robot, clock):
+    clock.runs = True
     sent = robot.send_action(STILL | {"delta_x.pos": 0.02})
     assert sent["delta_x.pos"] == pytest.approx(0.02)
     wait_for(lambda: abs(robot.driver.position[0] - 0.47) < 1e-3)
@@ -129,8 +146,8 @@ def test_the_commanded_pose_stays_in_the_workspace_and_near_the_arm(robot):
     assert sent["delta_z.pos"] == pytest.approx(0.03 + 0.04 - 0.30)  # what was commanded, not what was asked
 
 
-def test_without_new_actions_the_arm_holds(robot, caplog):
-    robot.driver.follow = 0.01
+def test_without_new_actions_the_arm_holds(robot, clock, caplog):
+    robot.driver.follow, clock.runs = 0.01, True
     with caplog.at_level(logging.WARNING):
         robot.send_action(STILL | {"delta_y.pos": 0.03})
         wait_for(lambda: "holding" in caplog.text)
@@ -168,6 +185,7 @@ def test_disconnecting_stops_the_arm_in_any_state(robot):
     stream = robot._stream
     robot.driver.gripper_lost = True
     robot.disconnect()
+    stream.join(60)
     assert robot.driver.calls[-2:] == ["stop", "disconnect"] and not stream.is_alive() and not robot.is_connected
 
 
@@ -196,9 +214,9 @@ def test_a_lost_gripper_ends_the_episode(robot):
         robot.get_observation()
 
 
-def test_a_gripper_lost_between_actions_is_told_at_the_next(robot):
+def test_a_gripper_lost_between_actions_is_told_at_the_next(robot, clock):
     robot.send_action(STILL)
-    robot.driver.gripper_lost = True
+    robot.driver.gripper_lost = clock.runs = True
     wait_for(lambda: robot._stream.error is not None)  # the stream asked for the state, in which to hold
     robot.driver.gripper_lost = False
     with pytest.raises(GripperError, match="does not answer"):
@@ -301,6 +319,5 @@ def test_end_to_end_against_the_protocol_simulator():
                 robot.send_action(STILL | {"delta_z.pos": -0.004, "gripper.pos": start["gripper.pos"]})
                 goal -= 0.004
                 time.sleep(1 / 15)
-            time.sleep(1.0)
-            assert robot.get_observation()["ee_z.pos"] == pytest.approx(goal, abs=0.02)
+            wait_for(lambda: robot.get_observation()["ee_z.pos"] == pytest.approx(goal, abs=0.02))
             robot.disconnect()
