@@ -131,12 +131,15 @@ class LatentSafeConfig(PreTrainedConfig):
 
     @property
     def reward_delta_indices(self) -> None:
+        """No rewards are read."""
         return None
 
     def get_optimizer_preset(self) -> AdamConfig:
+        """Adam, as lerobot-train asks for it."""
         return AdamConfig(lr=self.optimizer_lr, weight_decay=0.0, grad_clip_norm=self.grad_clip_norm)
 
     def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
+        """Cosine decay to a twentieth after 100 steps of warm-up."""
         return CosineDecayWithWarmupSchedulerConfig(
             num_warmup_steps=100,
             num_decay_steps=self.scheduler_steps,

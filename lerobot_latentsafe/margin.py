@@ -48,9 +48,11 @@ class FailureMargin(nn.Module):
         self.net = nn.Sequential(*layers, nn.Linear(hidden, 1))
 
     def forward(self, features: Tensor) -> Tensor:
+        """l of features (..., D): (...,), not bounded."""
         return self.net(features).squeeze(-1)
 
     def bounded(self, features: Tensor) -> Tensor:
+        """tanh l of features (..., D): (...,) in (-1, 1)."""
         return torch.tanh(self(features))
 
 

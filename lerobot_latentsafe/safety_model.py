@@ -102,6 +102,7 @@ class SafetyModel(nn.Module):
 
     @property
     def device(self) -> torch.device:
+        """Where the weights lie."""
         return self.units.device
 
     @property

@@ -82,6 +82,7 @@ class Units(nn.Module):
 
     @property
     def device(self) -> torch.device:
+        """Where the numbers lie."""
         return self.action_low.device
 
     def normalise_action(self, action: Tensor) -> Tensor:

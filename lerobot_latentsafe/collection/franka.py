@@ -73,6 +73,7 @@ class Source:
 
     @property
     def n_episodes(self) -> int:
+        """Of a dataset of full size."""
         return sum(self.mix.values())
 
     def behavior(self, episode: int) -> str:

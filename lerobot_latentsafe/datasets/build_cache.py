@@ -77,12 +77,13 @@ class Pictures:
         self.manifest = {"image_size": image_size, "percepts": list(cameras)}
 
     def prepare(self, folder: Path, see: See, n_episodes: int) -> None:
-        pass
+        """Nothing is needed beforehand."""
 
     def start(self, folder: Path) -> None:
-        pass
+        """Read the principal components, and note their hash."""
 
     def perceive(self, images: dict[str, Tensor]) -> dict[str, np.ndarray]:
+        """Numbers of all frames of an episode: name -> (T, ...)."""
         return {key: (value * 255).round().to(torch.uint8).numpy() for key, value in images.items()}
 
 
@@ -144,10 +145,12 @@ class Tokens:
         save_file(self.perception.basis.state_dict(), folder / BASIS)
 
     def start(self, folder: Path) -> None:
+        """Read the principal components, and note their hash."""
         self.perception.basis.load_state_dict(load_file(folder / BASIS))
         self.manifest["basis_hash"] = hashlib.sha256((folder / BASIS).read_bytes()).hexdigest()[:16]
 
     def perceive(self, images: dict[str, Tensor]) -> dict[str, np.ndarray]:
+        """Numbers of all frames of an episode: name -> (T, ...)."""
         tokens = self._tokens(images)
         vector = self.perception.basis(tokens).numpy()
         if self.dtype == "float16":

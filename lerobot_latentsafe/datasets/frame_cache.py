@@ -10,11 +10,14 @@ import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from torch import Tensor
+
+if TYPE_CHECKING:  # the package imports this module, and LeRobot's datasets are heavy
+    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
 FOLDER, MANIFEST, BASIS, VERSION = "frame_cache", "manifest.json", "basis.safetensors", 2
 
@@ -23,7 +26,7 @@ class FrameCacheError(ValueError):
     """A frame cache that is torn, of another dataset, resolution or encoder."""
 
 
-def dataset_fingerprint(meta: LeRobotDatasetMetadata) -> str:
+def dataset_fingerprint(meta: "LeRobotDatasetMetadata") -> str:
     """Identifies a dataset by all but its cameras, so that a copy without images has the same one."""
     features = {k: [v["dtype"], list(v["shape"])] for k, v in meta.features.items() if k not in meta.camera_keys}
     statistics = {
@@ -53,7 +56,7 @@ class FrameCache:
     manifest: dict
 
     @classmethod
-    def open(cls, root: str | Path, meta: LeRobotDatasetMetadata | None = None) -> "FrameCache":
+    def open(cls, root: str | Path, meta: "LeRobotDatasetMetadata | None" = None) -> "FrameCache":
         """Open the cache in a dataset's folder, checking it against the dataset's metadata.
 
         Raises:
@@ -92,6 +95,7 @@ class FrameCache:
 
     @property
     def image_size(self) -> int:
+        """Side of the pictures that were seen, pixels."""
         return self.manifest["image_size"]
 
     def require_image_size(self, size: int) -> None:

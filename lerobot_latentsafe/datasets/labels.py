@@ -102,6 +102,7 @@ class Sidecar:
 
     @classmethod
     def empty(cls, n: int) -> "Sidecar":
+        """Labels of n frames that nobody has labelled."""
         return cls(np.full(n, UNLABELLED, np.int8), np.full(n, -1, np.int32), np.zeros(n, np.int64), [])
 
     @classmethod

@@ -54,6 +54,7 @@ class PatchEncoder(nn.Module):
 
     @torch.no_grad()
     def forward(self, images: Tensor) -> Tensor:
+        """Images (B, 3, S, S) in [0, 1] -> tokens (B, P, dim)."""
         size = images.shape[-1]
         if images.shape[-2] != size or size % self.patch:
             raise ValueError(
@@ -90,6 +91,7 @@ class DinoEncoder(PatchEncoder):
         self.n_skipped = 1 + getattr(model.config, "num_register_tokens", 0)
 
     def tokens(self, images: Tensor) -> Tensor:
+        """Tokens of normalised images (B, 3, S, S): (B, P, dim)."""
         return self.model(pixel_values=images).last_hidden_state[:, self.n_skipped :]
 
 
@@ -107,6 +109,7 @@ class _Conv(nn.Module):
         self.groups = len(weight) if weight.shape[1] == 1 else 1
 
     def forward(self, x: Tensor) -> Tensor:
+        """Images (B, 3, S, S) in [0, 1] -> tokens (B, P, dim)."""
         kernel = self.weight.shape[-1]
         missing = max((-(-x.shape[-1] // self.stride) - 1) * self.stride + kernel - x.shape[-1], 0)
         before, after = missing // 2, missing - missing // 2
@@ -130,6 +133,7 @@ class _Block(nn.Module):
         self.layers = nn.Sequential(*layers)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Images (B, 3, S, S) in [0, 1] -> tokens (B, P, dim)."""
         y = self.layers(x)
         return x + y if x.shape == y.shape else y
 
@@ -151,6 +155,7 @@ class EfficientNetLite0(PatchEncoder):
         return self._weights_hash
 
     def tokens(self, images: Tensor) -> Tensor:
+        """Tokens of normalised images (B, 3, S, S): (B, P, dim)."""
         grid = self.net(images.contiguous(memory_format=torch.channels_last))
         return grid.flatten(2).transpose(1, 2)
 

@@ -69,6 +69,7 @@ class FrameBasis(nn.Module):
         self.register_buffer("fitted", torch.zeros((), dtype=torch.bool))
 
     def forward(self, tokens: Tensor) -> Tensor:
+        """Tokens of frames (..., P, C) -> their components (..., K)."""
         if not self.fitted:
             raise RuntimeError(
                 "no principal components yet: they come with a token cache. Run latentsafe cache --encoder=auto and "
@@ -113,6 +114,7 @@ class Perception(nn.Module):
 
     @property
     def encoder(self) -> PatchEncoder:
+        """The frozen encoder."""
         return self._encoder[0]
 
     def tokens(self, images: dict[str, Tensor]) -> Tensor:
@@ -134,5 +136,6 @@ class Perception(nn.Module):
         self.basis.load_state_dict(load_file(file))
 
     def forward(self, images: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Tokens of frames (..., P, C) -> their components (..., K)."""
         tokens = self.tokens(images)
         return {"tokens": tokens, "vector": self.basis(tokens)}

@@ -49,10 +49,12 @@ class LatentSafeDubinsEnv(EnvConfig):
 
     @property
     def package_name(self) -> str:
+        """Of the gymnasium ids."""
         return "lerobot_latentsafe"
 
     @property
     def gym_kwargs(self) -> dict:
+        """What the environment is made with."""
         return {
             "variant": self.variant,
             "episode_length": self.episode_length,
@@ -104,10 +106,12 @@ class FrankaEnv(EnvConfig):
 
     @property
     def package_name(self) -> str:
+        """Of the gymnasium ids."""
         return "lerobot_latentsafe"
 
     @property
     def gym_kwargs(self) -> dict:
+        """What the environment is made with."""
         return {
             "variant": self.variant,
             "episode_length": self.episode_length,

@@ -61,6 +61,7 @@ class DubinsEnv(gym.Env):
         return self._observation(), self._info(success=False)
 
     def step(self, action: np.ndarray):
+        """One Euler step under (turn rate, speed); see the class for when an episode ends."""
         action = np.asarray(action, float).reshape(-1)
         if action.shape != (2,) or not np.isfinite(action).all():
             raise ValueError(f"action is {action}; expected a finite turn rate in rad/s and the speed in m/s")
@@ -77,6 +78,7 @@ class DubinsEnv(gym.Env):
         return self._observation(), float(success), bool(terminated), truncated, self._info(success)
 
     def render(self) -> np.ndarray:
+        """The camera's picture (H, W, 3), uint8."""
         return self.renderer(self.state[None])[0]
 
     def _sample_anywhere(self) -> np.ndarray:

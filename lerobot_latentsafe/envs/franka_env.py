@@ -51,6 +51,7 @@ class FrankaEnv(gym.Env):
         return self._observation(), self._info()
 
     def step(self, action: np.ndarray):
+        """One control step under an action (7,) in robot units."""
         action = np.asarray(action, float).reshape(-1)
         if action.shape != (len(ACTION_NAMES),) or not np.isfinite(action).all():
             raise ValueError(f"action is {action}; expected finite numbers for {', '.join(ACTION_NAMES)}")
@@ -61,9 +62,11 @@ class FrankaEnv(gym.Env):
         return self._observation(), float(info["reward"]), False, truncated, info
 
     def render(self) -> np.ndarray:
+        """The front camera's picture (H, W, 3), uint8."""
         return self.scene.render("front")
 
     def close(self) -> None:
+        """Free the OpenGL context."""
         self.scene.close()
 
     def _observation(self) -> dict:

@@ -184,6 +184,7 @@ class Episodes:
 
     @classmethod
     def joined(cls, parts: "list[Episodes]") -> "Episodes":
+        """All of these, one after the other."""
         arrays = ("success", "violation", "steps", "overridden", "action_change", "severity")
         joined = {name: np.concatenate([getattr(p, name) for p in parts]) for name in arrays}
         lists = {name: [x for p in parts for x in getattr(p, name)] for name in ("traces", "frames", "latents")}

@@ -118,6 +118,7 @@ class BagScene(FrankaScene):
     """Different heaps of candies; each is dropped and settled once, then moved about with the bag."""
 
     def place_objects(self, rng: np.random.Generator) -> None:
+        """Bag and candies somewhere on the table, turned anyhow."""
         heap = int(rng.integers(self.n_settled))
         centre = np.array([0.50, 0.0]) + rng.uniform(-0.11, 0.11, 2)
         yaw = rng.uniform(-np.pi, np.pi)
@@ -153,6 +154,7 @@ class BagScene(FrankaScene):
     # The modelled grasp
 
     def set_fingers(self, travel: float, substep: int) -> None:
+        """Command the fingers, and model the grasp."""
         if substep % 8 == 1:
             self._grasp(travel)
         self.data.ctrl[7:9] = np.maximum(travel, self.stop)
@@ -192,10 +194,12 @@ class BagScene(FrankaScene):
         data.eq_active[segment.weld] = 1
 
     def extra_state(self) -> dict[str, np.ndarray]:
+        """Welds, the fingers' stop and the bag's yaw."""
         welds = [s.weld for s in self.segments]
         return {"welds": self.model.eq_data[welds].copy(), "stop": np.array(self.stop), "yaw": np.array(self.yaw)}
 
     def set_extra_state(self, extra: dict[str, np.ndarray]) -> None:
+        """Restore `extra_state`."""
         self.model.eq_data[[s.weld for s in self.segments]] = extra["welds"]
         self.stop, self.yaw = float(extra["stop"]), float(extra["yaw"])
 
@@ -225,6 +229,7 @@ class BagScene(FrankaScene):
         return held[0] if held else None
 
     def truth(self) -> dict[str, float | bool]:
+        """Spilled candies, whether it is lifted and by what; see the base class."""
         spilled = int(self.spilled().sum())
         held = self.held_segment()
         lifted = held is not None and self.segment_position(held)[2] - _z() > self.lift_height

@@ -48,6 +48,7 @@ class BlocksScene(FrankaScene):
         self.yaw = 0.0
 
     def place_objects(self, rng: np.random.Generator) -> None:
+        """The three blocks on their base somewhere on the table."""
         centre = np.array([0.48, 0.0]) + rng.uniform(-0.05, 0.05, 2)
         self.yaw = rng.uniform(-0.2, 0.2)
         along = np.array([-np.sin(self.yaw), np.cos(self.yaw)])
@@ -66,12 +67,15 @@ class BlocksScene(FrankaScene):
         return np.arccos(np.clip(self.data.xmat[self.bodies[1:], 8], -1, 1))
 
     def extra_state(self) -> dict[str, np.ndarray]:
+        """The base's yaw."""
         return {"yaw": np.array(self.yaw)}
 
     def set_extra_state(self, extra: dict[str, np.ndarray]) -> None:
+        """Restore `extra_state`."""
         self.yaw = float(extra["yaw"])
 
     def truth(self) -> dict[str, float | bool]:
+        """Tilt, whether one fell or the green one is up, and rewards; see the base class."""
         tilt = float(self.tilts().max())
         fallen = tilt > MAX_TILT
         green = self.block_position("green")

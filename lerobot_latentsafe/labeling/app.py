@@ -126,6 +126,7 @@ class LabelServer:
         return lambda request: Response(content, media_type=media_type)
 
     def dataset(self, request: Request) -> Response:
+        """What the page needs to know of the dataset."""
         meta = self.frames.meta
         return JSONResponse(
             {
@@ -153,6 +154,7 @@ class LabelServer:
         return JSONResponse({"changes": now, "entries": [self._entry(specification, e) for e in episodes]})
 
     async def label(self, request: Request) -> Response:
+        """Set a verdict; it is on disk when the answer comes."""
         specification, asked = self._specification(request), await _body(request)
         episode = _number(asked.get("episode"), "episode", len(self.store) - 1)
         first = asked.get("first")
@@ -163,6 +165,7 @@ class LabelServer:
         return self._changed(specification, episode)
 
     async def undo(self, request: Request) -> Response:
+        """Take back the tab's last change."""
         specification, tab = self._specification(request), _text((await _body(request)).get("tab"))
         undone = await run_in_threadpool(self.store.undo, specification, tab)
         return self._changed(specification, undone[0]) if undone else JSONResponse({"entry": None})
@@ -174,11 +177,13 @@ class LabelServer:
         return Response(self._pack(camera, episode), media_type="application/octet-stream")
 
     def margin(self, request: Request) -> Response:
+        """The filter's margin along an episode, if it has judged it."""
         episode = _number(request.path_params["episode"], "episode", len(self.store) - 1)
         known = self.suggester.known.get(episode) if self.suggester else None
         return JSONResponse({"margin": None if known is None else [round(float(l), 3) for l in known.margin]})
 
     def suggestion_arrived(self, episode: int) -> None:
+        """Note that an episode has been judged, for tabs to ask."""
         self.changes.append((None, episode))
 
     def _specification(self, request: Request) -> str:

@@ -38,6 +38,7 @@ def find_disagreements(
 
 
 def in_words(first: int | None, length: int) -> str:
+    """A verdict on an episode of so many frames."""
     if first is None:
         return "mixed labels"
     return "never fails" if first == length else f"fails from frame {first}"

@@ -77,6 +77,7 @@ class LabelStore:
 
     @property
     def specifications(self) -> list[str]:
+        """Names of what can fail."""
         return list(self._files)
 
     def __len__(self) -> int:

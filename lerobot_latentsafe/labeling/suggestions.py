@@ -40,6 +40,7 @@ class Suggestion:
 
     @classmethod
     def of(cls, margin: np.ndarray) -> "Suggestion":
+        """From a margin (T,)."""
         worst = np.sort(margin)[:WORST].mean()
         return cls(margin, best_split(margin), float(1 - abs(worst - DOUBTFUL) / (1 - DOUBTFUL)))
 
@@ -96,6 +97,7 @@ class Suggester:
             on_new(episode)
 
     def close(self) -> None:
+        """Stop judging."""
         self._process.terminate()
 
 

@@ -114,6 +114,7 @@ class GraspPredictionStep(ObservationProcessorStep):
 
     @torch.no_grad()
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
+        """An observation with the motion until the next grasp as `observation.environment_state` (B, 2M)."""
         perception = self.perception
         missing = [key for key in (*perception.image_keys, OBS_STATE) if key not in observation]
         if missing:
@@ -126,6 +127,7 @@ class GraspPredictionStep(ObservationProcessorStep):
         return {**observation, OBS_ENV_STATE: aim.in_detail(aim(tokens, observation[OBS_STATE]))}
 
     def get_config(self) -> dict[str, Any]:
+        """What makes this step again."""
         return {
             "encoder": self.perception.config.encoder,
             "encoder_hash": self.perception.config.encoder_hash,
@@ -135,14 +137,17 @@ class GraspPredictionStep(ObservationProcessorStep):
         }
 
     def state_dict(self) -> dict[str, Tensor]:
+        """Weights of the network, not of the encoder."""
         return {name: value.clone() for name, value in self.aim.state_dict().items()}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Take over weights of `state_dict`."""
         self.aim.load_state_dict(state)
 
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
     ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
+        """Features with what this step adds."""
         seen = PolicyFeature(FeatureType.ENV, (2 * self.sizes["n_moves"],))
         observed = {**features.get(PipelineFeatureType.OBSERVATION, {}), OBS_ENV_STATE: seen}
         return {**features, PipelineFeatureType.OBSERVATION: observed}
@@ -171,9 +176,11 @@ class TwoValuedStep(PolicyActionProcessorStep):
         return action
 
     def get_config(self) -> dict[str, Any]:
+        """What makes this step again."""
         return {"levels": self.levels}
 
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
     ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
+        """Features with what this step adds."""
         return features

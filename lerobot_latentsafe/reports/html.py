@@ -52,10 +52,12 @@ COLOURS = ("#1f6fb4", "#888888", "#2a9d5c", "#b0428f")
 
 
 def paragraph(text: str, note: bool = False) -> str:
+    """Text, in an orange box if it is a note."""
     return f"<p{' class=note' if note else ''}>{html.escape(text)}</p>"
 
 
 def heading(text: str) -> str:
+    """A heading of the second level."""
     return f"<h2>{html.escape(text)}</h2>"
 
 

@@ -32,6 +32,7 @@ class WorldModelConfig(draccus.ChoiceRegistry, abc.ABC):
 
     @property
     def type(self) -> str:
+        """The name it is registered by."""
         return self.get_choice_name(type(self))
 
     def of_cache(self, manifest: dict) -> "WorldModelConfig":

@@ -71,9 +71,11 @@ class DinoWMConfig(WorldModelConfig):
     blind: bool = False
 
     def of_cache(self, manifest: dict) -> "DinoWMConfig":
+        """With the encoder of a token cache; see the base class."""
         return replace(self, perception=self.perception.of_cache(manifest))
 
     def build(self, image_keys: list[str], state_dim: int, action_dim: int) -> "DinoWM":
+        """A DINO-WM with fresh weights."""
         if not image_keys:
             raise ValueError("a DINO-WM needs at least one camera, got none; record observation.image* features")
         perception = Perception(self.perception, image_keys, self.image_size)
@@ -161,32 +163,39 @@ class DinoWM(TerminationHead):
 
     @property
     def percept_names(self) -> list[str]:
+        """Tokens of the frame."""
         return ["tokens"]
 
     def perceive(self, images: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Camera key -> (B, 3, S, S) to tokens (B, P, C)."""
         perception = self._perception[0]
         if perception is None:
             raise RuntimeError("this DINO-WM was made for tokens; build it from its configuration to let it see images")
         return {"tokens": perception.tokens(images)}
 
     def initial(self, batch_size: int) -> Latent:
+        """Nothing seen, no frames remembered: (B, ...)."""
         latent = {name: self.position.new_zeros(batch_size, *size) for name, size in self.sizes.items()}
         seen = torch.zeros(batch_size, dtype=torch.long, device=self.position.device)
         past = self.transformer.empty_past(batch_size, len(self.position))
         return {**latent, "seen": seen, **dict(zip(self.past_names, past))}
 
     def step(self, latent: Latent, action: Tensor) -> Latent:
+        """Next latent under actions (B, A), from the frame and the H - 1 before it."""
         past = [latent[name] for name in self.past_names]
         now = (latent["tokens"], latent["state"], action, latent["seen"])
         return self._next_latent(self._advance(*(t[:, None] for t in now), past), 0, latent["seen"], action)
 
     def correct(self, predicted: Latent, percepts: dict[str, Tensor], state: Tensor) -> Latent:
+        """The tokens and state that were seen in place of those predicted."""
         return {**predicted, "tokens": self._looked_at(percepts), "state": state}
 
     def features(self, latent: Latent) -> Tensor:
+        """Summary of the tokens, context and state side by side: (..., D)."""
         return torch.cat([self.summary(latent["tokens"]), latent["context"], latent["state"]], -1)
 
     def error(self, latent: Latent, percepts: dict[str, Tensor], state: Tensor) -> Tensor:
+        """Mean squared error of the tokens (of the state, if blind): (B,)."""
         if self.config.blind:
             return (latent["state"] - state).square().mean(-1)
         return (latent["tokens"] - percepts["tokens"]).square().mean((-2, -1))

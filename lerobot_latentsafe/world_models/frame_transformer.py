@@ -75,6 +75,7 @@ class Linear(nn.Linear):
     """
 
     def forward(self, x: Tensor) -> Tensor:
+        """(..., n_in) -> (..., n_out)."""
         rows = x.numel() // self.in_features
         if rows < 256 or x.device.type != "cpu" or x.dtype != torch.float32:
             return super().forward(x)
@@ -102,6 +103,7 @@ class _Block(nn.Module):
     def forward(
         self, x: Tensor, past: Tensor, visible: Tensor, rotation: Tensor, condition: Tensor | None
     ) -> tuple[Tensor, Tensor]:
+        """(..., n_in) -> (..., n_out)."""
         if self.modulation is None:
             attended, kept = self._attend(self.attention_norm(x), past, visible, rotation)
             x = x + attended

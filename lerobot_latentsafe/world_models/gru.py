@@ -47,9 +47,11 @@ class GRUConfig(WorldModelConfig):
     blind: bool = False
 
     def of_cache(self, manifest: dict) -> "GRUConfig":
+        """With the encoder and the components of a token cache; see the base class."""
         return replace(self, perception=self.perception.of_cache(manifest))
 
     def build(self, image_keys: list[str], state_dim: int, action_dim: int) -> "FrameGRU":
+        """A GRU with fresh weights."""
         return FrameGRU(self, image_keys, state_dim, action_dim)
 
 
@@ -83,20 +85,25 @@ class FrameGRU(WorldModel):
 
     @property
     def percept_names(self) -> list[str]:
+        """Components of the frame, and its tokens if a summary is learned."""
         return ["vector", "tokens"] if self.config.summary else ["vector"]
 
     def load_basis(self, root: Path) -> None:
+        """Principal components from a dataset's token cache."""
         self.perception.load_basis(basis_file(root))
 
     def perceive(self, images: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Camera key -> (B, 3, S, S) to vector (B, C), and tokens (B, P, D) with a summary."""
         seen = self.perception(images)
         return {name: seen[name] for name in self.percept_names}
 
     def initial(self, batch_size: int) -> Latent:
+        """Zeros: (B, ...)."""
         weight = self.change[-1].weight
         return {name: weight.new_zeros(batch_size, size) for name, size in self.sizes.items()}
 
     def step(self, latent: Latent, action: Tensor) -> Latent:
+        """Next latent under actions (B, A): one GRU step, then the change of frame and state."""
         frame = torch.cat([latent["vector"], latent["state"]], -1)
         hidden = self.cell(torch.cat([self.frame_in(frame), self.action_in(action)], -1), latent["hidden"])
         frame = frame + self.change(torch.cat([hidden, frame], -1))
@@ -104,6 +111,7 @@ class FrameGRU(WorldModel):
         return {"hidden": hidden, "vector": vector, "state": state, "action": action}
 
     def correct(self, predicted: Latent, percepts: dict[str, Tensor], state: Tensor) -> Latent:
+        """The frame and state that were seen in place of those predicted."""
         return {**predicted, "vector": self._vector(percepts), "state": state}
 
     def _vector(self, percepts: dict[str, Tensor]) -> Tensor:
@@ -114,12 +122,15 @@ class FrameGRU(WorldModel):
         return torch.zeros_like(vector) if self.config.blind else vector
 
     def features(self, latent: Latent) -> Tensor:
+        """hidden, vector and state side by side: (..., D)."""
         return torch.cat([latent["hidden"], latent["vector"], latent["state"]], -1)
 
     def ended(self, latent: Latent) -> Tensor:
+        """Never: recordings do not end by themselves."""
         return torch.zeros(latent["hidden"].shape[:-1], dtype=torch.bool, device=latent["hidden"].device)
 
     def error(self, latent: Latent, percepts: dict[str, Tensor], state: Tensor) -> Tensor:
+        """Squared distance of frame and state from what was seen, summed: (B,)."""
         seen = self.correct(latent, percepts, state)
         return sum((latent[name] - seen[name]).square().sum(-1) for name in ("vector", "state"))
 

@@ -20,5 +20,6 @@ class PatchSummary(nn.Module):
         self.norm = nn.LayerNorm(2 * width)
 
     def forward(self, tokens: Tensor) -> Tensor:
+        """Tokens (..., P, C) -> mean and maximum over patches (..., 2 width)."""
         patches = self.leave(F.gelu(self.enter(tokens) + self.position))
         return self.norm(torch.cat([patches.mean(-2), patches.amax(-2)], -1))

@@ -62,6 +62,7 @@ class RSSMConfig(WorldModelConfig):
     decoder: bool = True
 
     def build(self, image_keys: list[str], state_dim: int, action_dim: int) -> "RSSM":
+        """An RSSM with fresh weights."""
         return RSSM(self, image_keys, state_dim, action_dim)
 
 
@@ -195,23 +196,28 @@ class RSSM(TerminationHead):
     # -- the model ---
 
     def initial(self, batch_size: int) -> Latent:
+        """The learned start of h and the prior's centre of x: (B, ...)."""
         h = torch.tanh(self.h0).expand(batch_size, -1)
         action = h.new_zeros(batch_size, self.action_dim)
         return {"h": h, "x": self.stochastic.centre(self._prior(h)), "action": action}
 
     def step(self, latent: Latent, action: Tensor) -> Latent:
+        """Next latent under actions (B, A): x is the prior's mean or mode."""
         h = self._recur(latent["h"], latent["x"], action)
         return {"h": h, "x": self.stochastic.centre(self._prior(h)), "action": action}
 
     def sample_step(self, latent: Latent, action: Tensor) -> Latent:
+        """Next latent under actions (B, A): x is drawn from the prior."""
         h = self._recur(latent["h"], latent["x"], action)
         return {"h": h, "x": self.stochastic.sample(self._prior(h)), "action": action}
 
     def correct(self, predicted: Latent, percepts: dict[str, Tensor], state: Tensor) -> Latent:
+        """x of the posterior given what was seen, h as predicted."""
         posterior = self._posterior(predicted["h"], self.embed(percepts, state))
         return {**predicted, "x": self.stochastic.centre(posterior)}
 
     def features(self, latent: Latent) -> Tensor:
+        """x and h side by side: (..., D)."""
         return torch.cat([latent["x"], latent["h"]], -1)
 
     def latent_of(self, features: Tensor, action: Tensor) -> Latent:
@@ -221,6 +227,7 @@ class RSSM(TerminationHead):
 
     @property
     def draws(self) -> bool:
+        """Whether it kept its decoders."""
         return self.config.decoder
 
     def stop_drawing(self) -> None:
@@ -228,6 +235,7 @@ class RSSM(TerminationHead):
         self.decoders, self.config = nn.ModuleDict(), replace(self.config, decoder=False)
 
     def error(self, latent: Latent, percepts: dict[str, Tensor], state: Tensor) -> Tensor:
+        """Mean squared error of decoded pictures, or of features where it cannot draw: (B,)."""
         if not self.draws:
             seen = self.features(self.correct(latent, percepts, state))
             return (self.features(latent) - seen).square().mean(-1)

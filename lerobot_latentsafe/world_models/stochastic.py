@@ -18,6 +18,7 @@ class Gaussian:
         self.dim, self.n_raw, self.min_std = size, 2 * size, min_std
 
     def read(self, raw: Tensor) -> Statistics:
+        """Raw output (..., n_raw) -> statistics."""
         mean, std = raw.chunk(2, -1)
         return mean, 2 * torch.sigmoid(std / 2) + self.min_std
 
@@ -26,6 +27,7 @@ class Gaussian:
         return statistics[0]
 
     def sample(self, statistics: Statistics) -> Tensor:
+        """One draw: x (..., dim)."""
         mean, std = statistics
         return mean + std * randn_like(std)
 
@@ -47,6 +49,7 @@ class Categorical:
         self.dim = self.n_raw = size * classes
 
     def read(self, raw: Tensor) -> Statistics:
+        """Raw output (..., n_raw) -> statistics."""
         probabilities = raw.unflatten(-1, (self.size, self.classes)).softmax(-1)
         return ((1 - self.unimix) * probabilities + self.unimix / self.classes,)
 
@@ -56,6 +59,7 @@ class Categorical:
         return self._one_hot(probabilities.argmax(-1))
 
     def sample(self, statistics: Statistics) -> Tensor:
+        """One draw: x (..., dim)."""
         (probabilities,) = statistics
         below = probabilities.cumsum(-1) < rand_like(probabilities[..., :1])
         drawn = self._one_hot(below.sum(-1).clamp(max=self.classes - 1))

@@ -20,6 +20,7 @@ class TerminationHead(WorldModel):
         self.register_buffer("ends_seen", torch.zeros(()))
 
     def ended(self, latent: Latent) -> Tensor:
+        """Whether the head says that the episode is over: bool (...,)."""
         over = self.continues(self.features(latent)).squeeze(-1) < 0
         return over & (self.ends_seen > 0)  # a head that never saw an end knows nothing
 

@@ -107,6 +107,7 @@ class TwoHotHead(nn.Module):
         self.register_buffer("bins", torch.linspace(-config.limit, config.limit, config.bins), persistent=False)
 
     def forward(self, features: Tensor) -> Tensor:
+        """The mean of features (..., D): (...,)."""
         return symexp(self.net(features).softmax(-1) @ self.bins)
 
     def loss(self, features: Tensor, target: Tensor) -> Tensor:
@@ -131,6 +132,7 @@ class Actor(nn.Module):
         self.net = nn.Sequential(mlp(feature_dim, config.hidden, config.layers), last)
 
     def distribution(self, features: Tensor) -> torch.distributions.Normal:
+        """Of actions, given features (..., D)."""
         mean, std = self.net(features).chunk(2, -1)
         std = self.min_std + (self.max_std - self.min_std) * torch.sigmoid(std - 2)
         return torch.distributions.Normal(torch.tanh(mean), std, validate_args=False)  # checks wait for the GPU
@@ -149,6 +151,7 @@ class Actor(nn.Module):
         return (self.distribution(features).log_prob(action) * self.varies).sum(-1)
 
     def entropy(self, features: Tensor) -> Tensor:
+        """Of the actions given features (..., D): (...,)."""
         return (self.distribution(features).entropy() * self.varies).sum(-1)
 
 

@@ -34,20 +34,25 @@ class LatentSafeDreamerConfig(PreTrainedConfig):
 
     @property
     def observation_delta_indices(self) -> None:
+        """It is not trained by lerobot-train."""
         return None
 
     @property
     def action_delta_indices(self) -> None:
+        """It is not trained by lerobot-train."""
         return None
 
     @property
     def reward_delta_indices(self) -> None:
+        """It is not trained by lerobot-train."""
         return None
 
     def get_optimizer_preset(self) -> None:
+        """It is not trained by lerobot-train."""
         return None
 
     def get_scheduler_preset(self) -> None:
+        """It is not trained by lerobot-train."""
         return None
 
     def validate_features(self) -> None:

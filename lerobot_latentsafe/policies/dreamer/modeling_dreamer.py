@@ -57,6 +57,7 @@ class LatentSafeDreamerPolicy(PreTrainedPolicy):
         return self._model[0]
 
     def train(self, mode: bool = True) -> "LatentSafeDreamerPolicy":
+        """Policy and world model to training, or to evaluation."""
         self.model.train(mode)
         return super().train(mode)
 
@@ -102,9 +103,11 @@ class LatentSafeDreamerPolicy(PreTrainedPolicy):
     # -- learning ---
 
     def get_optim_params(self) -> list:
+        """Parameters of actor, critic and reward head."""
         return [*self.actor.parameters(), *self.critic.parameters(), *self.reward.parameters()]
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
+        """Refused: this policy learns from episodes of its own."""
         raise UntrainedFilterError(
             "a latentsafe_dreamer policy learns from episodes of its own: train it with latentsafe train-dreamer"
         )

@@ -71,6 +71,7 @@ class FrankyDriver:
         self._width, self._moving = GRIPPER_WIDTH, None
 
     def connect(self) -> None:
+        """Reach robot and gripper; see `FrankaDriver`."""
         try:
             import franky
         except ImportError as e:
@@ -94,6 +95,7 @@ class FrankyDriver:
             raise GripperError(f"no gripper at {config.ip}: {e}. Is the Franka Hand initialised in Desk?") from e
 
     def start(self) -> None:
+        """Begin to hold the present pose."""
         with self._arm_errors():
             self.tracker = self.franky.CartesianImpedanceTracker(
                 self.robot,
@@ -102,6 +104,7 @@ class FrankyDriver:
             )
 
     def state(self) -> ArmState:
+        """The newest state."""
         with self._arm_errors():
             state = self.robot.state
             pose = self.robot.current_pose.end_effector_pose
@@ -112,16 +115,19 @@ class FrankyDriver:
         return ArmState(np.asarray(state.q, float).ravel(), tool, rotation, self._read_width())
 
     def track(self, position: np.ndarray, rotation: Rotation) -> None:
+        """Pull towards a pose, from now on."""
         end_effector = position - rotation.apply([0, 0, self.config.tool_offset])
         with self._arm_errors():
             self.tracker.set_target(self.franky.Affine(end_effector, rotation.as_quat()))
 
     def move_joints(self, joints: np.ndarray) -> None:
+        """Go slowly to joint angles (7,), and wait."""
         self.stop()
         with self._arm_errors():
             self.robot.move(self.franky.JointMotion(list(joints)))
 
     def move_gripper(self, width: float) -> None:
+        """Begin to open or close to a width in m."""
         try:
             if width < 0.5 * self._width:  # closing on something: press, whatever is between the fingers
                 force, any_width = self.config.gripper_force, GRIPPER_WIDTH
@@ -132,18 +138,21 @@ class FrankyDriver:
             raise GripperError(f"the gripper does not move: {e}") from e
 
     def recover(self) -> None:
+        """Clear a reflex."""
         self.tracker = None
         with self._arm_errors():
             if not self.robot.recover_from_errors():
                 raise FrankaError("the robot does not recover; release the user stop and clear the error in Desk")
 
     def stop(self) -> None:
+        """Come to rest."""
         tracker, self.tracker = self.tracker, None
         if tracker is not None:
             with self._arm_errors():
                 tracker.stop()
 
     def disconnect(self) -> None:
+        """Stop, and let go of the robot."""
         try:
             self.stop()
         finally:

@@ -54,19 +54,23 @@ class LatentSafeFranka(Robot):
 
     @cached_property
     def observation_features(self) -> dict:
+        """Numbers of the state and shapes of the pictures."""
         shapes = {name: (camera.height, camera.width, 3) for name, camera in self.config.cameras.items()}
         return {**dict.fromkeys(STATE_NAMES, float), **shapes}
 
     @cached_property
     def action_features(self) -> dict:
+        """Names of the actions."""
         return dict.fromkeys(ACTION_NAMES, float)
 
     @property
     def is_connected(self) -> bool:
+        """Whether cameras and arm answered."""
         return self._connected
 
     @property
     def is_calibrated(self) -> bool:
+        """Always: at the factory."""
         return True
 
     def calibrate(self) -> None:
@@ -76,6 +80,7 @@ class LatentSafeFranka(Robot):
         """Configured on connect."""
 
     def connect(self, calibrate: bool = True) -> None:
+        """Connect cameras and arm, and begin to hold still."""
         if self.is_connected:
             raise DeviceAlreadyConnectedError(f"{self} is already connected")
         for camera in self.cameras.values():

@@ -39,19 +39,23 @@ class LatentSafeFrankaMujoco(Robot):
 
     @cached_property
     def observation_features(self) -> dict:
+        """Numbers of the state and shapes of the pictures."""
         size = self.config.image_size or SCENES[self.config.scene].image_size
         return {**dict.fromkeys(STATE_NAMES, float), **dict.fromkeys(CAMERAS, (size, size, 3))}
 
     @cached_property
     def action_features(self) -> dict:
+        """Names of the actions."""
         return dict.fromkeys(ACTION_NAMES, float)
 
     @property
     def is_connected(self) -> bool:
+        """Whether there is a scene."""
         return self.scene is not None
 
     @property
     def is_calibrated(self) -> bool:
+        """Always."""
         return True
 
     def calibrate(self) -> None:
@@ -61,6 +65,7 @@ class LatentSafeFrankaMujoco(Robot):
         """A simulation needs none."""
 
     def connect(self, calibrate: bool = True) -> None:
+        """Make the scene and its first episode."""
         if self.is_connected:
             raise DeviceAlreadyConnectedError(f"{self} is already connected")
         scene = make_scene(self.config.scene, self.config.variant, self.config.image_size)
@@ -78,6 +83,7 @@ class LatentSafeFrankaMujoco(Robot):
         self.episode += 1
 
     def get_observation(self) -> dict:
+        """State and pictures; begins an episode that LeRobot has announced."""
         self._require_connection()
         announced = self._events.take()
         if isinstance(announced, int):
@@ -108,6 +114,7 @@ class LatentSafeFrankaMujoco(Robot):
         return sent
 
     def disconnect(self) -> None:
+        """Close the scene."""
         self._require_connection()
         self._events.stop()
         _connected.remove(self)

@@ -17,14 +17,17 @@ class DeviceConfig(draccus.ChoiceRegistry):
 
     @classmethod
     def get_known_choices(cls) -> dict[str, type]:
+        """All registered teleoperators but this one."""
         return {name: kind for name, kind in TeleoperatorConfig.get_known_choices().items() if name != NAME}
 
     @classmethod
     def get_choice_class(cls, name: str) -> type:
+        """The configuration class of a name."""
         return cls.get_known_choices()[name]
 
     @classmethod
     def get_choice_name(cls, subcls: type) -> str:
+        """The name of a configuration class."""
         return TeleoperatorConfig.get_choice_name(subcls)
 
 

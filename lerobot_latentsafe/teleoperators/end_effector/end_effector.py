@@ -35,33 +35,42 @@ class LatentSafeEndEffector(Teleoperator):
 
     @cached_property
     def action_features(self) -> dict:
+        """Names of the Franka's actions."""
         return dict.fromkeys(ACTION_NAMES, float)
 
     @property
     def feedback_features(self) -> dict:
+        """The device's."""
         return self.device.feedback_features or {}
 
     @property
     def is_connected(self) -> bool:
+        """Whether the device is."""
         return self.device.is_connected
 
     @property
     def is_calibrated(self) -> bool:
+        """Always: the device calibrates itself."""
         return True
 
     def calibrate(self) -> None:
+        """Calibrate the device."""
         self.device.calibrate()
 
     def configure(self) -> None:
+        """Configure the device."""
         self.device.configure()
 
     def connect(self, calibrate: bool = True) -> None:
+        """Connect the device."""
         self.device.connect()
 
     def disconnect(self) -> None:
+        """Disconnect the device."""
         self.device.disconnect()
 
     def send_feedback(self, feedback: dict[str, Any]) -> None:
+        """Pass feedback on to the device."""
         self.device.send_feedback(feedback)
 
     def get_action(self) -> dict[str, float]:

@@ -29,18 +29,22 @@ class LatentSafeScripted(Teleoperator):
 
     @cached_property
     def action_features(self) -> dict:
+        """Names of the Franka's actions."""
         return dict.fromkeys(ACTION_NAMES, float)
 
     @cached_property
     def feedback_features(self) -> dict:
+        """None."""
         return {}
 
     @property
     def is_connected(self) -> bool:
+        """Whether `connect` was called."""
         return self._connected
 
     @property
     def is_calibrated(self) -> bool:
+        """Always."""
         return True
 
     def calibrate(self) -> None:
@@ -50,6 +54,7 @@ class LatentSafeScripted(Teleoperator):
         """Needs none."""
 
     def connect(self, calibrate: bool = True) -> None:
+        """Be ready; the robot is found at the first action."""
         # The robot is found at the first action: lerobot-record connects teleoperators before robots.
         self._connected = True
 
@@ -70,4 +75,5 @@ class LatentSafeScripted(Teleoperator):
         """There is nothing to feel."""
 
     def disconnect(self) -> None:
+        """Let go."""
         self._connected = False
