@@ -5,9 +5,9 @@ import torch
 from hub_stub import Hub
 from huggingface_hub import ModelCard, constants
 
-from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, UntrainedFilterError
+from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.runtime.checkpoint import CheckpointError
-from lerobot_latentsafe.runtime.hub import HubUnreachableError, push_filter
+from lerobot_latentsafe.runtime.hub import HubUnreachableError, push_policy, save_policy
 
 
 def point_to(monkeypatch, url, cache):
@@ -57,16 +57,16 @@ def assert_same_decisions(first, second):
 
 
 def test_pulled_filter_decides_as_the_pushed_one(hub, policy):
-    policy.config.epsilon = 0.03
-    url = push_filter(policy, "me/filter", "me/car")
+    policy.config.law.epsilon = 0.03
+    url = push_policy(policy, "me/filter", "me/car")
     assert url == f"{hub.url}/me/filter"
     pulled = LatentSafePolicy.from_pretrained("me/filter")
-    assert pulled.config.epsilon == 0.03
+    assert pulled.config.law.epsilon == 0.03
     assert_same_decisions(policy, pulled)
 
 
 def test_pushed_folder_holds_what_lerobots_commands_need(hub, policy):
-    push_filter(policy, "me/filter", "me/car")
+    push_policy(policy, "me/filter", "me/car")
     expected = {
         "README.md", "config.json", "integrity.json", "model.safetensors", "policy_preprocessor.json",
         "policy_postprocessor.json",
@@ -76,10 +76,10 @@ def test_pushed_folder_holds_what_lerobots_commands_need(hub, policy):
 
 def test_shielded_policy_travels_with_its_base(hub, policy, tiny_diffusion):
     policy.attach(tiny_diffusion)
-    push_filter(policy, "me/shielded", "me/car")
+    push_policy(policy, "me/shielded", "me/car")
     assert "base_policy/model.safetensors" in hub.repos["me/shielded"]
     pulled = LatentSafePolicy.from_pretrained("me/shielded")
-    assert pulled.base.config.type == "diffusion" and "cache" in str(pulled.base.path)
+    assert pulled.base.config.type == "diffusion" and "cache" in pulled.config.base_policy_path
     assert_same_decisions(policy, pulled)
 
 
@@ -91,14 +91,14 @@ def test_base_policy_may_come_from_the_hub(hub, policy, tiny_diffusion):
 
 
 def test_pushing_again_replaces(hub, policy):
-    push_filter(policy, "me/filter", "me/car")
-    policy.config.epsilon = 0.5
-    push_filter(policy, "me/filter", "me/car")
-    assert LatentSafePolicy.from_pretrained("me/filter").config.epsilon == 0.5
+    push_policy(policy, "me/filter", "me/car")
+    policy.config.law.epsilon = 0.5
+    push_policy(policy, "me/filter", "me/car")
+    assert LatentSafePolicy.from_pretrained("me/filter").config.law.epsilon == 0.5
 
 
 def test_weights_tampered_with_on_the_hub_are_refused(hub, policy):
-    push_filter(policy, "me/filter", "me/car")
+    push_policy(policy, "me/filter", "me/car")
     weights = bytearray(hub.repos["me/filter"]["model.safetensors"])
     weights[-1] ^= 1
     hub.repos["me/filter"]["model.safetensors"] = bytes(weights)
@@ -107,12 +107,12 @@ def test_weights_tampered_with_on_the_hub_are_refused(hub, policy):
 
 
 def test_card_says_what_it_is_and_what_it_is_not(hub, policy):
-    policy.config.epsilon = 0.0125
+    policy.config.law.epsilon = 0.0125
     policy.config.calibration = {
         "epsilon": 0.0125, "missed": 0.05, "false_alarms": 0.1, "lead_steps": 3.0, "failing_episodes": 40.0,
         "safe_frames": 900.0,
     }  # fmt: skip
-    push_filter(policy, "me/filter", "me/car")
+    push_policy(policy, "me/filter", "me/car")
     card = ModelCard(hub.repos["me/filter"]["README.md"].decode())
     assert card.data.license == "apache-2.0" and "latentsafe" in card.data.tags and card.data.datasets == "me/car"
     for text in ("not a certified", "| epsilon | 0.0125 |", "40 held-out failing episodes", "20 fps", "me/filter"):
@@ -136,13 +136,13 @@ def test_card_admits_an_epsilon_set_by_hand(policy):
 
 
 def test_card_says_above_what_the_base_policy_is_released(policy):
-    policy.config.epsilon, policy.config.release = 0.4, 0.5
+    policy.config.law.epsilon, policy.config.law.resume_above = 0.4, 0.5
     card = policy.generate_model_card("me/car", "latentsafe", None, None)
     assert "| epsilon | 0.4; once the filter acts, 0.5 |" in card.text
 
 
 def test_card_says_how_much_the_filter_remembers(policy):
-    policy.config.memory = 24
+    policy.config.law.history_frames = 24
     card = policy.generate_model_card("me/car", "latentsafe", None, None)
     assert "px; remembers 24 frames at most |" in card.text
 
@@ -153,9 +153,9 @@ def test_card_says_what_acts_in_place_of_an_unsafe_action(policy):
         return card.text.split("| fallback | ")[1].split(" |")[0]
 
     assert said() == "the critic's action"
-    policy.config.retreat, policy.config.dwell = {"turn_rate.vel": -0.5}, 15
+    policy.config.law.retreat, policy.config.law.min_retreat_steps = {"turn_rate.vel": -0.5}, 15
     assert said() == "the retreat (turn_rate.vel -0.5 a step) for at least 15 steps"
-    policy.config.patience = 2
+    policy.config.law.retreat_after = 2
     assert said().startswith("the critic's action; after 2 overrides within 10 steps the retreat (turn_rate.vel")
 
 
@@ -167,7 +167,7 @@ def test_unknown_id_is_a_clear_error(hub):
 def test_unreachable_hub_leaves_the_local_filter_alone(no_hub, tiny_filter):
     policy, before = LatentSafePolicy.from_pretrained(tiny_filter), contents(tiny_filter)
     with pytest.raises(HubUnreachableError, match=r"cannot create me/filter on http://127.*untouched.*later"):
-        push_filter(policy, "me/filter", "me/car")
+        push_policy(policy, "me/filter", "me/car")
     assert contents(tiny_filter) == before and policy.config.repo_id is None
 
 
@@ -177,7 +177,7 @@ def test_push_that_breaks_off_is_a_clear_error(hub, policy, monkeypatch):
 
     monkeypatch.setattr("huggingface_hub.HfApi.upload_folder", broken)
     with pytest.raises(HubUnreachableError, match=r"broke off.*push again"):
-        push_filter(policy, "me/filter", "me/car")
+        push_policy(policy, "me/filter", "me/car")
 
 
 def test_unreachable_hub_is_a_clear_error_when_pulling(no_hub):
@@ -187,12 +187,15 @@ def test_unreachable_hub_is_a_clear_error_when_pulling(no_hub):
 
 def test_offline_mode_is_named(policy):
     with pytest.raises(HubUnreachableError, match="offline"):
-        push_filter(policy, "me/filter", "me/car")
+        push_policy(policy, "me/filter", "me/car")
 
 
-def test_untrained_filter_is_not_pushed(hub, cache_meta):
-    with pytest.raises(UntrainedFilterError):
-        push_filter(tiny.new_policy(cache_meta), "me/filter", "me/car")
+def test_untrained_filter_is_not_pushed(hub, cache_meta, tmp_path):
+    from lerobot_latentsafe.cli import main
+
+    save_policy(tiny.new_policy(cache_meta), tmp_path / "untrained")
+    with pytest.raises(SystemExit, match="its world model was never trained"):
+        main(["push", f"--policy.path={tmp_path / 'untrained'}", "--repo_id=me/filter"])
     assert not hub.repos
 
 
@@ -209,24 +212,24 @@ def test_push_command_reports_an_unreachable_hub(no_hub, tiny_filter):
 @pytest.fixture
 def seeing(token_root):
     """The filter of a gru world model, whose encoder is not part of its checkpoint."""
-    policy = tiny.new_policy(tiny.metadata(token_root), world_model=tiny.gru_config(), action_candidates=None)
-    policy.config.stage, policy.config.frame_cache = "reachability", None
+    policy = tiny.new_policy(tiny.metadata(token_root), world_model=tiny.gru_config(), fallback_action_candidates=None)
+    policy.config.trained_on.stage, policy.config.frame_cache = "critic", None
     return policy.eval()
 
 
 def test_filter_on_tokens_comes_back_with_its_basis_and_the_same_encoder(hub, seeing):
-    push_filter(seeing, "me/bag", "me/car")
+    push_policy(seeing, "me/bag", "me/car")
     assert not [name for name in hub.repos["me/bag"] if "encoder" in name]
     pulled = LatentSafePolicy.from_pretrained("me/bag")
     ours, theirs = (p.config.world_model.perception for p in (seeing, pulled))
     assert theirs.encoder_hash == ours.encoder_hash and theirs.basis_hash == ours.basis_hash
-    assert pulled.world_model.perception.basis.fitted
+    assert pulled.model.world_model.perception.basis.fitted
     assert_same_decisions(seeing, pulled)
 
 
 def test_an_encoder_with_other_weights_is_refused(hub, seeing):
     seeing.config.world_model.perception.encoder_hash = "0" * 16
-    push_filter(seeing, "me/bag", "me/car")
+    push_policy(seeing, "me/bag", "me/car")
     with pytest.raises(ValueError, match="0000000000000000"):
         LatentSafePolicy.from_pretrained("me/bag")
 
@@ -234,9 +237,8 @@ def test_an_encoder_with_other_weights_is_refused(hub, seeing):
 def test_card_names_the_encoder_and_what_was_measured(hub, seeing, tmp_path):
     from lerobot_latentsafe.cli import main
     from lerobot_latentsafe.evaluation.statistics import wilson, write_json
-    from lerobot_latentsafe.runtime.checkpoint import save_filter
 
-    save_filter(seeing, tmp_path / "filter")
+    save_policy(seeing, tmp_path / "filter")
     rates = {"spilled": wilson(3, 100), "success": wilson(90, 100), "overridden_share": 0.123, "lost": [1, 2]}
     cells = {"bare": {"spilled": wilson(70, 100)}, "plan": {"pooled": {"spilled": wilson(44, 100)}}}
     cells["reachability"] = {"outputs/filter": {"spilled": wilson(55, 100)}, "pooled": rates}
@@ -285,3 +287,13 @@ def test_lerobots_own_push_is_the_same(hub, seeing, shielded, tiny_diffusion):
     assert (pulled.base is not None) == shielded
     assert "not a certified" in hub.repos["me/trained"]["README.md"].decode()
     assert_same_decisions(seeing, pulled)
+
+
+def test_a_task_policy_is_pushed_without_what_belongs_to_a_filter(hub, tiny_dreamer, tmp_path):
+    from lerobot_latentsafe.cli import main
+
+    options = [f"--policy.path={tiny_dreamer / 'policy'}", "--repo_id=me/task"]
+    with pytest.raises(SystemExit, match="belong to a filter"):
+        main(["push", *options, "--results=[results.json]"])
+    main(["push", *options])
+    assert "Task policy learned in imagination" in hub.repos["me/task"]["README.md"].decode()

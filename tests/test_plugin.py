@@ -79,8 +79,10 @@ def test_wheel_is_named_as_lerobot_looks_for_it(wheel):
 
 def test_wheel_holds_every_module_and_checkpoint(installed):
     package = REPOSITORY / "lerobot_latentsafe"
-    data = [f for folder in ("pretrained", "envs/assets") for f in (package / folder).rglob("*") if f.is_file()]
-    wanted = [*package.rglob("*.py"), *data]
+    folders = ("pretrained", "franka/assets", "labeling/page")
+    data = {folder: [f for f in (package / folder).rglob("*") if f.is_file()] for folder in folders}
+    assert all(data.values())
+    wanted = [*package.rglob("*.py"), *(f for files in data.values() for f in files)]
     missing = [f.relative_to(REPOSITORY) for f in wanted if not (installed / f.relative_to(REPOSITORY)).exists()]
     assert [f for f in missing if f.parts[1] != "_plugin"] == []
     assert (installed / "lerobot_policy_latentsafe" / "__init__.py").exists()
@@ -115,6 +117,7 @@ def test_importing_the_package_loads_nothing_heavy(discovered):
     heavy = {
         "mujoco", "mink", "franky", "matplotlib", "scipy", "jax", "hj_reachability", "transformers", "datasets",
         "pandas",
-        "lerobot_latentsafe.modeling_latentsafe", "lerobot_latentsafe.dubins.car", "lerobot_latentsafe.commands",
+        "lerobot_latentsafe.modeling_latentsafe", "lerobot_latentsafe.dubins.car", "lerobot_latentsafe.cli",
+        "lerobot_latentsafe.api",
     }  # fmt: skip
     assert heavy.isdisjoint(discovered["loaded"])

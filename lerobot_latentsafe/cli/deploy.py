@@ -80,6 +80,7 @@ class Push:
                 raise ValueError("--base_policy_path and --results belong to a filter; --policy.path is a task policy")
             return LatentSafeDreamerPolicy.from_pretrained(self.policy.path)
         policy = load_filter(self.policy.path, base_policy=self.base_policy_path)
+        policy.model.require_stage("world_model")
         evaluation = dict(policy.config.evaluation)
         for file in self.results:
             evaluation |= measured(file, policy.config.law.name)
