@@ -23,7 +23,7 @@ demo-bag: setup
 	$(PYTHON) scripts/demo_bag.py --policy="$(POLICY)" $(if $(BASE),--base="$(BASE)")
 
 test: lint
-	HF_HUB_OFFLINE=1 $(PYTHON) -m pytest -n logical --maxprocesses 4
+	HF_HUB_OFFLINE=1 $(PYTHON) -m pytest -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 	$(PYTHON) scripts/fill_results.py --check
 
 lint: setup

@@ -24,6 +24,15 @@ torch.set_num_threads(1)
 logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
 
 
+LONGEST = ("test_ranks.py", "test_pretrained.py", "test_labeling_page.py", "test_token_cache.py")
+
+
+def pytest_collection_modifyitems(items):
+    """The files that take longest come first: cores that are done early take from what is left."""
+    place = {name: i for i, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path.name, len(place)))
+
+
 @pytest.fixture(autouse=True)
 def seeded():
     torch.manual_seed(0)

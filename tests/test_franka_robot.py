@@ -105,7 +105,7 @@ def test_every_behavior_is_documented_and_the_other_way_round():
     assert set(BEHAVIORS) == {*BAG, *BLOCKS}
 
 
-def test_lerobot_record_writes_labelless_episodes_that_replay(tmp_path):
+def test_lerobot_record_writes_labelless_episodes_that_replay(tmp_path, virtual_time):
     """lerobot-record itself, in this process: half a second an episode."""
     from lerobot.configs.dataset import DatasetRecordConfig
     from lerobot.scripts.lerobot_record import RecordConfig, record

@@ -1,5 +1,5 @@
 import shutil
-import time
+from queue import Queue
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,6 +13,9 @@ from lerobot_latentsafe.labeling import suggestions
 from lerobot_latentsafe.labeling.disagreements import find_disagreements
 from lerobot_latentsafe.labeling.store import LabelStore
 from lerobot_latentsafe.labeling.suggestions import Suggester, Suggestion, best_split, contradiction
+
+PATIENCE_S = 1200
+"""For a process that yields to all others."""
 
 
 @pytest.fixture
@@ -70,11 +73,9 @@ def test_margins_are_those_of_filtering_frame_by_frame(policy, dataset_meta, cac
 
 
 def test_a_process_of_its_own_judges_all_episodes(root, tiny_filter):
-    new = []
-    suggester = Suggester(str(tiny_filter), tiny.REPO_ID, root, new.append)
-    end = time.time() + 60
-    while len(suggester.known) < 14 and time.time() < end:
-        time.sleep(0.2)
+    told = Queue()
+    suggester = Suggester(str(tiny_filter), tiny.REPO_ID, root, told.put)
+    new = [told.get(timeout=PATIENCE_S) for _ in range(13)]
     suggester.close()
     assert sorted(suggester.known) == list(range(14)) and sorted(new) == list(range(1, 14))
 

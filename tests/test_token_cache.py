@@ -85,7 +85,7 @@ def test_processes_share_the_work(dataset_root, token_root, tmp_path):
         subprocess.Popen(command, env={**os.environ, "RANK": str(rank), "WORLD_SIZE": "2"}, stdout=subprocess.PIPE)
         for rank in range(2)
     ]
-    said = [rank.communicate(timeout=120)[0].decode() for rank in ranks]
+    said = [rank.communicate(timeout=1200)[0].decode() for rank in ranks]
     assert [rank.returncode for rank in ranks] == [0, 0] and any("train with" in text for text in said)
     alone = build_frame_cache(LeRobotDataset(tiny.REPO_ID, root=dataset_root), tmp_path / "alone", 16)
     for name, whole in alone.percepts.items():
