@@ -10,16 +10,7 @@ states (safe with three actions, unsafe with two) that they call unsafe. The ful
 import argparse
 from pathlib import Path
 
-import numpy as np
-import torch
-
-from lerobot_latentsafe.dubins.car import TURN_RATES
-from lerobot_latentsafe.dubins.ground_truth import exact_value, grid_states
-from lerobot_latentsafe.evaluation.statistics import confusion, provenance, wilson, write_json
-from lerobot_latentsafe.experiments.dubins.figures import value_slices
-from lerobot_latentsafe.experiments.dubins.monitor import LatentMonitor
-from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
-from lerobot_latentsafe.reports.figures import save
+from lerobot_latentsafe.experiments.dubins.ablation import write_ablation
 
 
 def main() -> None:
@@ -28,24 +19,7 @@ def main() -> None:
     parser.add_argument("--full", required=True, help="trained on all three actions: the control")
     parser.add_argument("--output_dir", type=Path, default=Path("results/dubins"))
     arguments = parser.parse_args()
-    torch.set_num_threads(1)
-
-    states = grid_states()
-    left_only, all_three = exact_value(states, tuple(TURN_RATES[1:])), exact_value(states)
-    needs_right = (all_three > 0) & (left_only <= 0)
-    rows, monitors = {}, {}
-    for name, path in (("left_only", arguments.filter), ("full", arguments.full)):
-        monitors[name] = LatentMonitor(LatentSafePolicy.from_pretrained(path))
-        unsafe = monitors[name].value(states) <= 0
-        rows[name] = {
-            "against_left_only_truth": confusion(~unsafe, left_only > 0),
-            "against_full_truth": confusion(~unsafe, all_three > 0),
-            "right_turn_only_called_unsafe": wilson(np.sum(unsafe & needs_right), needs_right.sum()),
-        }
-        print(name, rows[name]["right_turn_only_called_unsafe"], rows[name]["against_left_only_truth"]["f1_unsafe"])
-    write_json(arguments.output_dir / "ablation.json", {**provenance([0]), "rows": rows})
-    figure = value_slices({"left only": monitors["left_only"]}, tuple(TURN_RATES[1:]))
-    save(figure, arguments.output_dir / "ablation.png")
+    write_ablation(arguments.filter, arguments.full, arguments.output_dir)
 
 
 if __name__ == "__main__":

@@ -1,57 +1,10 @@
+#!/usr/bin/env python
 """Contact sheets of what the simulated Franka's operators do: results/franka/<name>.png, one row an episode.
 
 python scripts/franka_pictures.py
 """
 
-from pathlib import Path
-
-import numpy as np
-from PIL import Image
-
-from lerobot_latentsafe.franka.behaviors import begin
-from lerobot_latentsafe.franka.scenes import make_scene
-
-OUT = Path("results/franka")
-SHEETS = {
-    "bag": (
-        [("red", "closed_end"), ("red", "middle"), ("red", "open_end"), ("red", "side_to_side"), ("red", "random")],
-        [0, 14, 26, 34, 37, 40, 45, 60],
-    ),
-    "bag_variants": (
-        [(variant, "closed_end") for variant in ("green", "purple", "cloth", "stiff", "heavy", "sealed")],
-        [0, 14, 26, 34, 37, 40, 45, 60],
-    ),
-    "blocks": (
-        [("standard", "pluck_careful"), ("standard", "pluck_careless"), ("standard", "random")],
-        [0, 8, 16, 22, 26, 30, 36, 50],
-    ),
-}
-"""Name -> (variant, behaviour) of each row, and the control steps shown."""
-
-
-def row(name: str, variant: str, behavior: str, steps: list[int], seed: int = 5) -> np.ndarray:
-    """The front camera's images above the wrist camera's."""
-    scene = make_scene(name, variant, 128)
-    scene.reset(seed)
-    actions = begin(behavior, scene, None, np.random.default_rng(seed))
-    action, columns = np.zeros(7), []
-    for t in range(steps[-1] + 1):
-        if t in steps:
-            columns.append(np.vstack([scene.render("front"), scene.render("wrist")]))
-        action = next(actions, np.append(np.zeros(6), action[6]))
-        scene.step(action)
-    scene.close()
-    return np.hstack(columns)
-
-
-def main() -> None:
-    OUT.mkdir(parents=True, exist_ok=True)
-    for sheet, (rows, steps) in SHEETS.items():
-        scene = sheet.split("_")[0]
-        picture = np.vstack([row(scene, variant, behavior, steps) for variant, behavior in rows])
-        Image.fromarray(picture).quantize(128).save(OUT / f"{sheet}.png", optimize=True)
-        print(OUT / f"{sheet}.png")
-
+from lerobot_latentsafe.experiments.franka_pictures import draw_sheets
 
 if __name__ == "__main__":
-    main()
+    draw_sheets()

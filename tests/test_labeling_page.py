@@ -3,12 +3,10 @@
 import contextlib
 import os
 import re
-import runpy
 import shutil
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -57,9 +55,10 @@ class Server:
 @pytest.fixture(scope="module")
 def filmed(tmp_path_factory):
     """12 episodes of three small cameras."""
+    from lerobot_latentsafe.experiments.labelling_cost import CAMERAS, film
+
     root = tmp_path_factory.mktemp("filmed") / "cup"
-    bench = runpy.run_path(str(Path(__file__).parents[1] / "scripts" / "bench_labeling.py"))
-    bench["film"](root, 12, size=64, repo_id=tiny.REPO_ID, cameras=(*bench["CAMERAS"], "observation.images.side"))
+    film(root, 12, size=64, repo_id=tiny.REPO_ID, cameras=(*CAMERAS, "observation.images.side"))
     return root
 
 

@@ -7,6 +7,8 @@ import time
 from pathlib import Path
 
 BIN = Path(sys.executable).parent
+SIDE_BY_SIDE = "bare | shielded; orange: the filter acts"
+NO_GUARANTEE = "A learned filter is not a certified safety device: it carries no guarantee."
 
 
 class Demo:

@@ -1,0 +1,90 @@
+"""Time of a whole tick at the robot's rate: the filter, and a policy whose chunks are made in another thread."""
+
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import trange
+
+from lerobot_latentsafe.base_policy import BasePolicy
+from lerobot_latentsafe.evaluation.rollouts import Choice, steps
+from lerobot_latentsafe.evaluation.statistics import provenance, write_json
+from lerobot_latentsafe.experiments.bag.runs import FIRST_SEED, WARM_UP
+from lerobot_latentsafe.experiments.scene_world import SceneWorld
+from lerobot_latentsafe.franka.bag import BagScene
+from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
+
+DENOISING_STEPS = 10
+
+
+def shielded(path: str, base: str, ahead: int) -> LatentSafePolicy:
+    """A filter over a diffusion policy whose chunks are made so many actions ahead; 0: on the control thread."""
+    policy = load_filter(path)
+    policy.attach(BasePolicy.load(base, policy.config.device, ahead))
+    policy.base.policy.diffusion.num_inference_steps = DENOISING_STEPS
+    return policy
+
+
+class TimedShield:
+    """A filter over its base policy, or alone over a small motion.
+
+    Attributes:
+        began: when the last tick did.
+        ticks: wall seconds of each.
+    """
+
+    def __init__(self, policy: LatentSafePolicy, alone: bool):
+        policy.reset()
+        self.policy, self.alone, self.moving = policy, alone, policy.model.units.hold_action(1)
+        self.ticks: list[float] = []
+
+    @torch.no_grad()
+    def __call__(self, seen: dict[str, Tensor]) -> Choice:
+        # Up and down, for a picture that repeats itself is not encoded again.
+        self.moving[0, 2] = 0.005 * np.cos(len(self.ticks))
+        self.began = time.perf_counter()
+        shield, policy = self.policy.shield, self.policy
+        action = shield(seen, self.moving).action if self.alone else policy.select_action(seen)
+        self.ticks.append(time.perf_counter() - self.began)
+        return Choice(action.numpy())
+
+
+def episode(policy: LatentSafePolicy, scene: BagScene, n_steps: int, alone: bool) -> list[float]:
+    """Wall seconds of each tick; a tick begins no sooner than a period after the last."""
+    actor = TimedShield(policy, alone)
+    for _ in steps(SceneWorld(scene, n_steps), actor):
+        time.sleep(max(0.0, 1 / scene.fps - (time.perf_counter() - actor.began)))
+    return actor.ticks[WARM_UP:]
+
+
+def in_ms(ticks: list[float], period: float) -> dict[str, float]:
+    """Median, 99th percentile, and the share that is later than a period."""
+    ms = np.array(ticks) * 1e3
+    late = float((ms > period * 1e3).mean())
+    return {"n": len(ms), "p50_ms": float(np.median(ms)), "p99_ms": float(np.quantile(ms, 0.99)), "late": late}
+
+
+def write_times(path: str, base: str, ahead: int, n_rounds: int, n_steps: int, output: Path) -> None:
+    """Run each variant in turns, and write its times.
+
+    Args:
+        path, base: of a filter, and of a diffusion policy of the bag.
+        ahead: actions still to come when the next chunk is begun.
+        n_rounds, n_steps: episodes of each variant, and their length.
+    """
+    scene = BagScene()
+    on, off = (shielded(path, base, actions) for actions in (0, ahead))
+    variants = {"filter alone": (on, True), "chunks on the control thread": (on, False), "chunks ahead": (off, False)}
+    ticks: dict[str, list[float]] = {name: [] for name in variants}
+    for i in trange(n_rounds, unit="round"):
+        for name, (policy, alone) in variants.items():
+            scene.reset(FIRST_SEED + i)
+            torch.manual_seed(i)
+            ticks[name] += episode(policy, scene, n_steps, alone)
+    rows = {name: in_ms(values, 1 / scene.fps) for name, values in ticks.items()}
+    for name, values in rows.items():
+        print(name, {key: round(value, 3) for key, value in values.items()})
+    settings = {"threads": torch.get_num_threads(), "denoising_steps": DENOISING_STEPS, "ahead": ahead}
+    write_json(output, {**rows, **settings, **provenance([FIRST_SEED, FIRST_SEED + n_rounds - 1])})

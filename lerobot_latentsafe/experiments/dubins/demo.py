@@ -1,0 +1,182 @@
+"""The whole road in miniature: episodes -> world model -> reachability -> a shielded diffusion policy -> a report."""
+
+import json
+import shutil
+import threading
+from pathlib import Path
+
+import numpy as np
+
+from lerobot_latentsafe.dubins.ground_truth import grid_states
+from lerobot_latentsafe.experiments.demo import NO_GUARANTEE, SIDE_BY_SIDE, Demo
+from lerobot_latentsafe.model_card import rate_in_words
+from lerobot_latentsafe.reports import html
+
+CANDIDATES = "[[-1.25,1.0],[0.0,1.0],[1.25,1.0]]"
+
+
+class DubinsDemo(Demo):
+    """The car's road from episodes to a shielded policy."""
+
+    def data(self, source: str, n: int) -> str:
+        """Collect episodes and cache their frames; returns the cache's folder."""
+        root, repo = self.out / source, f"demo/{source}"
+        self.run(
+            f"collect {source}: {n} episodes",
+            *("latentsafe", "collect", f"--source={source}", f"--dataset.repo_id={repo}"),
+            *(f"--dataset.root={root}", f"--dataset.num_episodes={n}"),
+        )
+        self.run(
+            f"cache {source}",
+            *("latentsafe", "cache", f"--dataset.repo_id={repo}", f"--dataset.root={root}"),
+            f"--output_dir={root}_cache",
+        )
+        return f"{root}_cache"
+
+    def train(self, what: str, config: str, source: str, root: str, *options: str) -> str:
+        """Train by lerobot-train; returns the last checkpoint's folder."""
+        folder = self.out / f"train_{source}"
+        self.run(
+            f"train {what}",
+            *("lerobot-train", f"--config_path=configs/{config}.yaml", f"--dataset.repo_id=demo/{source}_cache"),
+            *(f"--dataset.root={root}", f"--output_dir={folder}", *options),
+        )
+        return str(folder / "checkpoints" / "last" / "pretrained_model")
+
+    def filter(self) -> str:
+        """Collect, cache, train the world model and the safety critic, set epsilon."""
+        root = self.data("random", 500)
+        checkpoint = self.train(
+            "world model and margin", "dubins_rssm", "random", root, f"--policy.frame_cache={root}",
+            f"--policy.fallback.action_candidates={CANDIDATES}", "--steps=2000", "--policy.scheduler_steps=2000",
+        )  # fmt: skip
+        self.run(
+            "reachability in imagination",
+            *("latentsafe", "train-reachability", f"--policy.path={checkpoint}", f"--output_dir={self.out}/critic"),
+            *("--dataset.repo_id=demo/random_cache", f"--dataset.root={root}", "--steps=4000"),
+        )
+        return f"{self.out}/critic"
+
+    def shield(self, critic: str, base: str, epsilon: float, n_episodes: int) -> None:
+        """Wrap filter and policy, compare the filter with the exact safe set, and drive bare and shielded."""
+        out = self.out
+        self.run(
+            "wrap",
+            *("latentsafe", "wrap", f"--policy.path={critic}", f"--base_policy_path={base}"),
+            *(f"--law.epsilon={epsilon}", "--law.proposal_steps=6", f"--output_dir={out}/shielded"),
+        )
+        np.save(out / "states.npy", grid_states()[::7])  # enough for a demonstration's three digits
+        self.run(
+            "monitor against the exact safe set",
+            *("latentsafe", "eval-monitor", f"--policy.path={out}/shielded", "--env.type=latentsafe_dubins"),
+            *(f"--states={out}/states.npy", f"--json={out}/monitor.json", f"--figure={out}/value_slices.png"),
+        )
+        self.run(
+            f"bare against shielded: {n_episodes} starts each",
+            *("latentsafe", "eval-shield", f"--policy.path={out}/shielded", "--env.type=latentsafe_dubins"),
+            *("--seed=500", f"--n_episodes={n_episodes}", f"--json={out}/shield.json"),
+            *(f"--figure={out}/trajectories.png", f"--video={out}/videos", "--n_videos=3"),
+        )
+
+    def reckless(self) -> str:
+        """Collect reckless demonstrations and train a diffusion policy on them."""
+        root = self.data("reckless", 60)
+        return self.train("reckless diffusion policy", "dubins_diffusion", "reckless", root, "--steps=400")
+
+
+def run_demo(out: Path, epsilon: float, n_episodes: int) -> None:
+    """Make the filter and the policy, compare, and write report.html and metrics.json.
+
+    Args:
+        out: folder; what is there is deleted.
+        epsilon: the filter acts where V <= epsilon.
+        n_episodes: starts, bare and shielded.
+    """
+    if out.exists():
+        shutil.rmtree(out)
+    demo = DubinsDemo(out)
+    # Two cores, two branches: the policy to be shielded is trained beside the filter.
+    found: dict[str, str] = {}
+    branch = threading.Thread(target=lambda: found.update(base=demo.reckless()))
+    branch.start()
+    critic = demo.filter()
+    branch.join()
+    if "base" not in found:
+        raise SystemExit("demo: the reckless policy could not be trained; see the message above")
+    demo.shield(critic, found["base"], epsilon, n_episodes)
+    report(out, demo.seconds)
+
+
+HEADER = ["diffusion policy", "safe success", "violation", "incompletion"]
+SCORES = {
+    "F1, safe positive": "f1_safe",
+    "F1, unsafe positive": "f1_unsafe",
+    "balanced accuracy": "balanced_accuracy",
+}
+
+
+def report(out: Path, seconds: float) -> None:
+    """Print the table; write metrics.json and report.html."""
+    shield, monitor = (json.loads((out / f"{name}.json").read_text()) for name in ("shield", "monitor"))
+    rows = [
+        [name, *(rate_in_words(shield[name][key]) for key in ("success", "violation", "incompletion"))]
+        for name in ("bare", "shielded")
+    ]
+    metrics = headline_numbers(shield, monitor, seconds)
+    (out / "metrics.json").write_text(json.dumps(metrics, indent=2))
+    names = {
+        "F1, safe positive": "f1_safe",
+        "F1, unsafe positive": "f1_unsafe",
+        "balanced accuracy": "balanced_accuracy",
+    }
+    scores = [[name, f"{monitor[key]:.3f}"] for name, key in names.items()]
+    html.write_report(
+        out / "report.html",
+        "A latent safety filter shields a reckless diffusion policy",
+        page(out, rows, scores, metrics),
+    )
+    print()
+    for row in [HEADER, *rows]:
+        print("".join(f"{cell:<30}" for cell in row))
+    acted, p_value = metrics["overridden_share"], metrics["violation_p_value"]
+    print(f"\nfilter acted in {acted:.1%} of steps; violations: p = {p_value:.1g}")
+    print("monitor against the exact safe set:", ", ".join(f"{name} {value}" for name, value in scores))
+    print(f"{metrics['minutes']} minutes. Open {out / 'report.html'}; numbers in {out / 'metrics.json'}")
+
+
+def headline_numbers(shield: dict, monitor: dict, seconds: float) -> dict:
+    """What metrics.json holds, of what eval-shield and eval-monitor wrote."""
+    rates = {f"{name}_{key}": shield[name][key] for name in ("bare", "shielded") for key in ("violation", "success")}
+    return {
+        **rates,
+        "violation_p_value": shield["violation_p_value"],
+        "significant": bool(shield["violation_p_value"] < 0.05),
+        "overridden_share": shield["shielded"]["overridden_share"],
+        **{key: monitor[key] for key in ("f1_safe", "f1_unsafe", "balanced_accuracy", "safe_policy")},
+        "minutes": round(seconds / 60, 1),
+    }
+
+
+def page(out: Path, rows: list[list[str]], scores: list[list[str]], metrics: dict) -> list[str]:
+    """The parts of report.html."""
+    return [
+        html.paragraph(
+            "A car should drive to the right edge without entering the red disc. A diffusion policy has learnt "
+            "it from demonstrations that cut through the disc. The filter has seen only random driving, through "
+            "a camera; it lets the policy drive and takes over when nothing else would keep the car out."
+        ),
+        html.heading("Bare and shielded from the same starts"),
+        html.table(HEADER, rows),
+        html.paragraph(
+            f"Shares with 95% Wilson intervals. The filter acted in {metrics['overridden_share']:.0%} of all steps. "
+            f"Exact test of the paired difference in violations: p = {metrics['violation_p_value']:.1g}."
+        ),
+        *(html.video(path, SIDE_BY_SIDE) for path in sorted(out.glob("videos/*.mp4"))),
+        html.picture(out / "trajectories.png", "All runs. Red: entered the disc. Orange: the filter acted."),
+        html.heading("The safe set it learnt from images"),
+        html.table(["against the exact solution", ""], scores),
+        html.picture(out / "value_slices.png", "Learned boundary (solid) and the exact one (dashed)."),
+        html.paragraph(
+            f"This is a small training for a demonstration; results/ holds the full one. {NO_GUARANTEE}", note=True
+        ),
+    ]
