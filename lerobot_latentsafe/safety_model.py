@@ -116,11 +116,14 @@ class SafetyModel(nn.Module):
         """Pictures (..., 3, H, W), uint8 or in [0, 1], as the world model takes them."""
         return to_model_images(images, self.config.world_model.image_size)
 
+    def place(self, numbers: Tensor) -> Tensor:
+        """Numbers on this model's device; of 64-bit floats, which Apple's GPUs do not have, single ones."""
+        return numbers.to(self.device, torch.float32) if numbers.is_floating_point() else numbers.to(self.device)
+
     def see(self, observation: dict[str, Tensor]) -> tuple[dict[str, Tensor], Tensor]:
         """Percepts and normalised proprioception (B, S) of a LeRobot batch of observations in robot units."""
-        device = self.device
-        images = {key: self.images(observation[key].to(device)) for key in self.world_model.image_keys}
-        state = self.units.normalise_state(observation["observation.state"].to(device))
+        images = {key: self.images(self.place(observation[key])) for key in self.world_model.image_keys}
+        state = self.units.normalise_state(self.place(observation["observation.state"]))
         return self.world_model.perceive(images), state
 
     # -- deciding ---

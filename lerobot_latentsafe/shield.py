@@ -198,7 +198,7 @@ class Shield:
                 f"{', '.join(k for k in observation if k.startswith('observation'))}. Rename the camera or state "
                 "(--rename_map), or train a filter for this robot"
             )
-        state = model.units.normalise_state(observation["observation.state"].to(model.device))
+        state = model.units.normalise_state(model.place(observation["observation.state"]))
         if self.executed is not None and len(self.executed) != len(state):
             raise ValueError(
                 f"the batch went from {len(self.executed)} to {len(state)} robots within an episode; "
@@ -208,7 +208,7 @@ class Shield:
         images = {}
         finite = torch.isfinite(state).all(-1)
         for key in cameras:
-            image = observation[key].to(model.device)
+            image = model.place(observation[key])
             check_proportions(key, tuple(image.shape[1:]), model.config.input_features[key].shape)
             low, high = image.amin((1, 2, 3)), image.amax((1, 2, 3))  # NaN if anything is; aminmax is five times slower
             usable = torch.isfinite(low) & torch.isfinite(high) & (low >= -1e-3) & (high <= 1 + 1e-3)
@@ -229,7 +229,7 @@ class Shield:
         if proposed is None:
             fault = first_fault(fault, torch.ones_like(fault, dtype=torch.bool), missing_reason)
             proposed = self._hold(state)
-        proposed = proposed.to(units.device, torch.float32)
+        proposed = self.model.place(proposed)
         expected = (len(state), len(units.action_low))
         if tuple(proposed.shape) != expected:
             raise ValueError(

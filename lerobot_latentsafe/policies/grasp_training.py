@@ -83,16 +83,8 @@ def with_aim(
     """
     cache, dataset = FrameCache.open(cache_root), LeRobotDataset(repo_id, root=cache_root)
     PerceptionConfig().of_cache(cache.manifest)
-    names, states = (dataset.meta.features[key]["names"] for key in ("action", OBS_STATE))
-    if switch not in names or not {*moved} <= {*states}:
-        raise ValueError(
-            f"{repo_id} lacks {switch} or one of {', '.join(moved)}, from which to learn where to aim; its commands "
-            f"are {', '.join(names)}, its state {', '.join(states)}"
-        )
-    episode = np.asarray(dataset.hf_dataset.with_format("numpy")["episode_index"])
-    where = cache.state[:, [states.index(name) for name in moved]]
-    move = torch.from_numpy(until_switched(where, cache.action[:, names.index(switch)], episode)).to(device)
-    odd = torch.from_numpy(episode % 2 == 1).to(device)
+    move, episode = _motions_until_grasp(cache, dataset, switch, moved)
+    move, odd = torch.from_numpy(move).to(device), torch.from_numpy(episode % 2 == 1).to(device)
     if not (move[odd].any() and move[~odd].any()):
         raise ValueError(f"{switch} hardly ever falls in {repo_id}; record more demonstrations, that grasp something")
     (percepts, state), n_cameras = cache.frames(np.arange(len(move)), ["tokens"]), len(cache.manifest["cameras"])
@@ -116,6 +108,21 @@ def with_aim(
     )
     save_file(aim.state_dict(), Path(output_dir) / AIM, metadata={"fingerprint": cache.manifest["fingerprint"]})
     return copy
+
+
+def _motions_until_grasp(
+    cache: FrameCache, dataset: LeRobotDataset, switch: str, moved: Sequence[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """How each frame's state moves until the switch next falls (N, M), and the frame's episode (N,)."""
+    names, states = (dataset.meta.features[key]["names"] for key in ("action", OBS_STATE))
+    if switch not in names or not {*moved} <= {*states}:
+        raise ValueError(
+            f"{dataset.repo_id} lacks {switch} or one of {', '.join(moved)}, from which to learn where to aim; its "
+            f"commands are {', '.join(names)}, its state {', '.join(states)}"
+        )
+    episode = np.asarray(dataset.hf_dataset.with_format("numpy")["episode_index"])
+    where = cache.state[:, [states.index(name) for name in moved]]
+    return until_switched(where, cache.action[:, names.index(switch)], episode), episode
 
 
 def check_seen(seen: str | Path, cache_root: str | Path) -> None:
