@@ -35,19 +35,6 @@ from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
 from lerobot_latentsafe.reports.figures import write_videos
 from lerobot_latentsafe.training import train_reachability
 
-__all__ = [
-    "EpisodeValues",
-    "FilterDecision",
-    "LatentSafePolicy",
-    "LawOptions",
-    "decide",
-    "evaluate_filter",
-    "load_filter",
-    "shield_policy",
-    "train_filter",
-    "values_along",
-]
-
 
 def shield_policy(
     policy: PreTrainedPolicy | str | Path,

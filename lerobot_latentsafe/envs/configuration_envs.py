@@ -11,9 +11,28 @@ from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES
 from lerobot_latentsafe.franka.scenes import SCENES, check_scene
 
 
+@dataclass
+class LatentSafeEnv(EnvConfig):
+    """An environment of this package, made from its variant, episode length and image size."""
+
+    @property
+    def package_name(self) -> str:
+        """Of the gymnasium ids."""
+        return "lerobot_latentsafe"
+
+    @property
+    def gym_kwargs(self) -> dict:
+        """What the environment is made with."""
+        return {
+            "variant": self.variant,
+            "episode_length": self.episode_length,
+            "image_size": self.image_size,
+        }
+
+
 @EnvConfig.register_subclass("latentsafe_dubins")
 @dataclass
-class LatentSafeDubinsEnv(EnvConfig):
+class LatentSafeDubinsEnv(LatentSafeEnv):
     """The paper's Dubins car (see `envs/dubins_env.py`).
 
     Attributes:
@@ -47,23 +66,9 @@ class LatentSafeDubinsEnv(EnvConfig):
         shape = (self.image_size, self.image_size, 3)
         self.features["pixels"] = PolicyFeature(type=FeatureType.VISUAL, shape=shape)
 
-    @property
-    def package_name(self) -> str:
-        """Of the gymnasium ids."""
-        return "lerobot_latentsafe"
-
-    @property
-    def gym_kwargs(self) -> dict:
-        """What the environment is made with."""
-        return {
-            "variant": self.variant,
-            "episode_length": self.episode_length,
-            "image_size": self.image_size,
-        }
-
 
 @dataclass
-class FrankaEnv(EnvConfig):
+class FrankaEnv(LatentSafeEnv):
     """A scene of the simulated Franka, with the features its robot records.
 
     Attributes:
@@ -103,20 +108,6 @@ class FrankaEnv(EnvConfig):
     def scene(self) -> str:
         """Name of the scene, from the type: latentsafe_<scene>."""
         return self.type.removeprefix("latentsafe_")
-
-    @property
-    def package_name(self) -> str:
-        """Of the gymnasium ids."""
-        return "lerobot_latentsafe"
-
-    @property
-    def gym_kwargs(self) -> dict:
-        """What the environment is made with."""
-        return {
-            "variant": self.variant,
-            "episode_length": self.episode_length,
-            "image_size": self.image_size,
-        }
 
 
 @EnvConfig.register_subclass("latentsafe_bag")

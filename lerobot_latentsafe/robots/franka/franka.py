@@ -21,6 +21,7 @@ from lerobot_latentsafe.franka.actions import (
 )
 from lerobot_latentsafe.robots.franka.config_franka import LatentSafeFrankaConfig
 from lerobot_latentsafe.robots.franka.driver import ArmState, FrankaDriver, FrankaError, FrankyDriver, GripperError
+from lerobot_latentsafe.robots.franka_device import FrankaDevice
 
 logger = logging.getLogger(__name__)
 
@@ -28,7 +29,7 @@ STREAM_HZ = 200
 DOWN = Rotation.from_matrix(POINTING_DOWN)
 
 
-class LatentSafeFranka(Robot):
+class LatentSafeFranka(FrankaDevice, Robot):
     """Follows end-effector deltas by Cartesian impedance.
 
     An action moves the commanded pose; a thread interpolates towards it over one control step and sends it on at 200
@@ -58,26 +59,10 @@ class LatentSafeFranka(Robot):
         shapes = {name: (camera.height, camera.width, 3) for name, camera in self.config.cameras.items()}
         return {**dict.fromkeys(STATE_NAMES, float), **shapes}
 
-    @cached_property
-    def action_features(self) -> dict:
-        """Names of the actions."""
-        return dict.fromkeys(ACTION_NAMES, float)
-
     @property
     def is_connected(self) -> bool:
         """Whether cameras and arm answered."""
         return self._connected
-
-    @property
-    def is_calibrated(self) -> bool:
-        """Always: at the factory."""
-        return True
-
-    def calibrate(self) -> None:
-        """The arm is calibrated at the factory; home the gripper in Desk after changing fingers."""
-
-    def configure(self) -> None:
-        """Configured on connect."""
 
     def connect(self, calibrate: bool = True) -> None:
         """Connect cameras and arm, and begin to hold still."""

@@ -8,13 +8,14 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 
 from lerobot_latentsafe.franka.actions import ACTION_NAMES, GRIPPER_NAME, JOINT_NAMES, STATE_NAMES, read_action
 from lerobot_latentsafe.franka.scenes import SCENES, make_scene
+from lerobot_latentsafe.robots.franka_device import FrankaDevice
 from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
 from lerobot_latentsafe.robots.lerobot_events import LeRobotEvents
 
 CAMERAS = ("front", "wrist")
 
 
-class LatentSafeFrankaMujoco(Robot):
+class LatentSafeFrankaMujoco(FrankaDevice, Robot):
     """One control step of physics for every action, however fast the caller runs.
 
     LeRobot's recording has no call that resets a scene: it *says* when an episode begins, to a person. The simulation
@@ -43,26 +44,10 @@ class LatentSafeFrankaMujoco(Robot):
         size = self.config.image_size or SCENES[self.config.scene].image_size
         return {**dict.fromkeys(STATE_NAMES, float), **dict.fromkeys(CAMERAS, (size, size, 3))}
 
-    @cached_property
-    def action_features(self) -> dict:
-        """Names of the actions."""
-        return dict.fromkeys(ACTION_NAMES, float)
-
     @property
     def is_connected(self) -> bool:
         """Whether there is a scene."""
         return self.scene is not None
-
-    @property
-    def is_calibrated(self) -> bool:
-        """Always."""
-        return True
-
-    def calibrate(self) -> None:
-        """A simulation needs none."""
-
-    def configure(self) -> None:
-        """A simulation needs none."""
 
     def connect(self, calibrate: bool = True) -> None:
         """Make the scene and its first episode."""

@@ -9,11 +9,12 @@ from lerobot.utils.errors import DeviceNotConnectedError
 
 from lerobot_latentsafe.franka.actions import ACTION_NAMES, action_limits
 from lerobot_latentsafe.franka.behaviors import begin
+from lerobot_latentsafe.robots.franka_device import FrankaDevice
 from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import connected_simulation
 from lerobot_latentsafe.teleoperators.scripted.config_scripted import LatentSafeScriptedConfig
 
 
-class LatentSafeScripted(Teleoperator):
+class LatentSafeScripted(FrankaDevice, Teleoperator):
     """Plays its behaviour from the start of each episode of the connected simulation, then holds still."""
 
     config_class = LatentSafeScriptedConfig
@@ -28,11 +29,6 @@ class LatentSafeScripted(Teleoperator):
         self._last = np.zeros(len(ACTION_NAMES))
 
     @cached_property
-    def action_features(self) -> dict:
-        """Names of the Franka's actions."""
-        return dict.fromkeys(ACTION_NAMES, float)
-
-    @cached_property
     def feedback_features(self) -> dict:
         """None."""
         return {}
@@ -41,17 +37,6 @@ class LatentSafeScripted(Teleoperator):
     def is_connected(self) -> bool:
         """Whether `connect` was called."""
         return self._connected
-
-    @property
-    def is_calibrated(self) -> bool:
-        """Always."""
-        return True
-
-    def calibrate(self) -> None:
-        """Needs none."""
-
-    def configure(self) -> None:
-        """Needs none."""
 
     def connect(self, calibrate: bool = True) -> None:
         """Be ready; the robot is found at the first action."""
