@@ -111,9 +111,9 @@ class CheckLabels:
 
     def run(self) -> None:
         """Write the page, and print the worst."""
-        frames = self.dataset.frames()
+        model, frames = load_filter(self.policy.path).model, self.dataset.frames()
         store = LabelStore(frames.root, frames.meta.repo_id, [self.specification])
-        margins = dict(episode_margins(load_filter(self.policy.path).model, frames))
+        margins = dict(episode_margins(model, frames))
         found = find_disagreements(store, self.specification, margins)
         for d in found[:20]:
             label = in_words(store.verdict(self.specification, d.episode).first, len(d.margin))
