@@ -93,11 +93,12 @@ class Option:
 
 
 def options_of(
-    options: type, chosen: dict[str, str] | None = None, prefix: str = "", defaults: Any = MISSING
+    options: Any, chosen: dict[str, str] | None = None, prefix: str = "", defaults: Any = MISSING
 ) -> Iterator[Option]:
     """All options of an options class, those of its groups, too.
 
     Args:
+        options: a dataclass.
         chosen: what was chosen of the choices, `env.type` -> its name; the options of another are left out.
         defaults: an object whose attributes are the defaults.
     """

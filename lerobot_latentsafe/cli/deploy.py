@@ -14,6 +14,7 @@ from lerobot_latentsafe.policies.dreamer.modeling_dreamer import LatentSafeDream
 from lerobot_latentsafe.runtime.checkpoint import read_config, resolve_checkpoint
 from lerobot_latentsafe.runtime.files import refuse_existing
 from lerobot_latentsafe.runtime.hub import push_policy, save_policy
+from lerobot_latentsafe.world_models.rssm import RSSM
 
 
 @dataclass
@@ -42,7 +43,7 @@ class Wrap:
         policy = load_filter(self.policy.path, law=self.law, base_policy=self.base_policy_path)
         if not self.drawing:
             world_model = policy.model.world_model
-            if not world_model.draws:
+            if not (isinstance(world_model, RSSM) and world_model.draws):
                 raise ValueError(f"--drawing=false, but the {world_model.config.type} world model draws nothing")
             world_model.stop_drawing()
             policy.config.change(world_model=world_model.config)

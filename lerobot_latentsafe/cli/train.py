@@ -39,10 +39,9 @@ class Cache:
 
     def run(self) -> None:
         """Build the cache, or go on building it."""
-        recipe, size = Pictures, self.image_size or 32
+        size, recipe = self.image_size or 32, Pictures
         if self.encoder:
-            size = self.image_size or 96
-            config = PerceptionConfig(encoder=self.encoder)
+            size, config = self.image_size or 96, PerceptionConfig(encoder=self.encoder)
             recipe = partial(Tokens, config=config, dtype=self.dtype, basis_from=self.basis_from)
         cache = build_frame_cache(self.dataset.opened(), self.output_dir, size, recipe, self.dataset.episodes)
         if cache is None:

@@ -73,7 +73,9 @@ class Pictures:
     """Each camera's picture, in 8 bits."""
 
     def __init__(self, cameras: list[str], image_size: int):
-        self.arrays = {key: ((3, image_size, image_size), "uint8") for key in cameras}
+        self.arrays: dict[str, tuple[tuple[int, ...], str]] = {
+            key: ((3, image_size, image_size), "uint8") for key in cameras
+        }
         self.manifest = {"image_size": image_size, "percepts": list(cameras)}
 
     def prepare(self, folder: Path, see: See, n_episodes: int) -> None:

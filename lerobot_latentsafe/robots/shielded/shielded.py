@@ -61,6 +61,7 @@ class LatentSafeShielded(Robot):
         self.journal = Journal(config.journal) if config.journal else None
         self._events = LeRobotEvents()
         self._sent: dict[str, float] = {}
+        self._sent_early: dict[str, float] | None = None
         self._early = False
         self._forget()
 
@@ -159,7 +160,8 @@ class LatentSafeShielded(Robot):
         Returns:
             What was executed.
         """
-        early, self._sent_early = self._sent_early, None
+        early = self._sent_early
+        self._sent_early = None
         if early is not None and action == early:
             return early
         shield, names = self.filter.shield, self._trained_on.action_names
@@ -296,7 +298,7 @@ class LatentSafeShielded(Robot):
         self.filter.shield.reset()
         self._observation, self._fresh, self._seen_at = None, False, 0.0
         self._phase: int | str | None = None
-        self._sent_early: dict[str, float] | None = None
+        self._sent_early = None
         self._decided_at: float | None = None
         self._gaps: deque[float] = deque(maxlen=RATE_DECISIONS)
         self._cameras: dict[str, dict] = {}
