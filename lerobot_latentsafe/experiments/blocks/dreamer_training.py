@@ -46,6 +46,7 @@ class TrainDreamer:
     """
 
     output_dir: Path
+    """The folder to write."""
     policy: PreTrainedConfig
     """A latentsafe_dreamer configuration: the actor-critic and its rewards."""
     model: PreTrainedConfig
@@ -71,8 +72,11 @@ class TrainDreamer:
     demonstration_share: float = 0.1
     """Of a batch, at least; more while they are a larger share of all episodes."""
     save_every: int = 1000
+    """Steps between checkpoints, from which a killed run goes on."""
     log_every: int = 100
+    """Steps between lines of the log."""
     seed: int = 0
+    """Of all that is drawn."""
 
     def __post_init__(self) -> None:
         for name, expected in (("policy", LatentSafeDreamerConfig), ("model", LatentSafeConfig)):
