@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from tqdm import trange
 
+from lerobot_latentsafe.critic import BACKUPS
 from lerobot_latentsafe.datasets.clips import ClipReader, FilterData
 from lerobot_latentsafe.latent import Latent, map_latent, select
 from lerobot_latentsafe.margin import FailureMargin, hinge_loss
@@ -68,7 +69,8 @@ def fit_margin(
         noise: standard deviation of Gaussian noise on the features, which are scaled to unit deviation meanwhile.
     """
     mean, std = features.mean(0), features.std(0).clamp(min=1e-3)
-    first = margin.net[0]
+    layers = [layer for layer in margin.net if isinstance(layer, nn.Linear)]
+    first, last = layers[0], layers[-1]
     optimizer = torch.optim.AdamW(margin.parameters(), 1e-3, weight_decay=0.3)
     for step in range(steps):
         for group in optimizer.param_groups:
@@ -84,8 +86,8 @@ def fit_margin(
         first.weight.div_(std)
         first.bias.sub_(first.weight @ mean)
         size = margin(features).abs().median().clamp(min=1e-3)
-        margin.net[-1].weight.div_(size)
-        margin.net[-1].bias.div_(size)
+        last.weight.div_(size)
+        last.bias.div_(size)
 
 
 def train_margin(path: str | Path, dataset_meta, output_dir: Path, seed: int = 0) -> LatentSafePolicy:
@@ -198,7 +200,10 @@ def train_reachability(
     Raises:
         UntrainedFilterError: the world model was never trained.
         FileExistsError: output_dir holds a checkpoint already.
+        ValueError: there is no such target.
     """
+    if target not in BACKUPS:
+        raise ValueError(f"--target is {target!r}; expected one of {', '.join(BACKUPS)}")
     refuse_existing(Path(output_dir) / CONFIG)
     policy, reader = load_with_cache(path, dataset_meta, seed)
     model, started = policy.model, time.process_time()

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 import tiny
 
+from lerobot_latentsafe.decision import LawOptions
 from lerobot_latentsafe.experiments.bag import runs
+from lerobot_latentsafe.experiments.filter_settings import FilterSetting, in_use
 from lerobot_latentsafe.franka.behaviors import hold
 from lerobot_latentsafe.reports import figures
 
@@ -77,26 +79,29 @@ def scene():
 
 @pytest.fixture(scope="module")
 def setting(tmp_path_factory):
-    folder = tiny.save_franka_filter(tmp_path_factory.mktemp("bag") / "filter", scene="bag", epsilon=0.25)
-    return runs.FilterSetting.of(str(folder), "plan", guard=2)
+    folder = tiny.save_franka_filter(tmp_path_factory.mktemp("bag") / "filter", scene="bag", law_epsilon=0.25)
+    return FilterSetting.of(str(folder), LawOptions(name="plan", proposal_steps=2))
 
 
 def test_a_setting_is_the_filters_own_unless_given(setting):
-    assert (setting.epsilon, setting.guard) == (0.25, 2)
-    config = setting.load().config
-    assert (config.law, config.epsilon, config.guard) == ("plan", 0.25, 2)
+    assert (setting.epsilon, setting.proposal_steps) == (0.25, 2)
+    law = setting.load().config.law
+    assert (law.name, law.epsilon, law.proposal_steps) == ("plan", 0.25, 2)
 
 
 def test_a_table_notes_how_its_filters_remember_and_retreat(setting, tmp_path):
-    assert runs.in_use([setting]) == {setting.path: {"epsilon": 0.25, "guard": 2, "release": -1.0}}
+    assert in_use([setting]) == {setting.path: {"epsilon": 0.25, "guard": 2, "release": -1.0}}
+    law = {"history_frames": 24, "retreat": {"delta_z.pos": -0.006}, "retreat_after": 1, "min_retreat_steps": 6}
+    own = {f"law_{name}": value for name, value in law.items()}
+    path = str(tiny.save_franka_filter(tmp_path / "filter", scene="bag", **own))
+    other = FilterSetting.of(path, LawOptions(name="margin"))
     ways = {"memory": 24, "retreat": {"delta_z.pos": -0.006}, "patience": 1, "dwell": 6}
-    other = runs.FilterSetting.of(str(tiny.save_franka_filter(tmp_path / "filter", scene="bag", **ways)), "margin")
-    assert runs.in_use([other])[other.path].items() >= ways.items()
+    assert in_use([other])[path].items() >= ways.items()
 
 
 def test_an_overridden_operator_goes_on_trying(scene, setting, monkeypatch):
     monkeypatch.setattr(runs, "STEPS", 4)
-    always = runs.FilterSetting.of(setting.path, "margin", epsilon=2.0)
+    always = FilterSetting.of(setting.path, LawOptions(name="margin", epsilon=2.0))
     frames = []
     scene.reset(0)
     ended = runs.drive(scene, always.load(), hold(1.0, 2), frames)

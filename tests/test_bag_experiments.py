@@ -3,15 +3,16 @@
 import importlib.util
 import json
 import sys
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 
 import pytest
 import tiny
 import torch
 
-from lerobot_latentsafe.experiments.bag import runs
+from lerobot_latentsafe.experiments.bag import demo, out_of_distribution, policies, runs
 from lerobot_latentsafe.experiments.demo import Demo
+from lerobot_latentsafe.experiments.scene_world import SceneWorld
 from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES, action_limits
 from lerobot_latentsafe.franka.bag import BagScene
 from lerobot_latentsafe.reports.html import PRINTED
@@ -22,7 +23,7 @@ STEPS, SEEDS = 4, [runs.FIRST_SEED, runs.FIRST_SEED + 1]
 @pytest.fixture(scope="module")
 def filter_path(tmp_path_factory):
     """A filter that never lets anything pass."""
-    return str(tiny.save_franka_filter(tmp_path_factory.mktemp("filter") / "first", scene="bag", epsilon=2.0))
+    return str(tiny.save_franka_filter(tmp_path_factory.mktemp("filter") / "first", scene="bag", law_epsilon=2.0))
 
 
 @pytest.fixture(scope="module")
@@ -48,76 +49,77 @@ def base_path(tmp_path_factory):
 
 @pytest.fixture
 def script(monkeypatch):
-    """A script as a module, on small pictures and for a few steps; `options` are its command line."""
-    observe = runs.observe
+    """Runs a script with the options of its command line, on small pictures and for a few steps."""
+    observe = SceneWorld.observe
 
-    def observe_state(scene):
-        seen = observe(scene)
+    def observe_state(world):
+        seen = observe(world)
         return {**seen, "observation.environment_state": seen["observation.state"]}
 
     monkeypatch.setattr(runs, "STEPS", STEPS)
-    monkeypatch.setattr(runs, "observe", observe_state)
+    monkeypatch.setattr(policies, "STEPS", STEPS)
+    monkeypatch.setattr(SceneWorld, "observe", observe_state)
+    monkeypatch.setattr(runs, "BagScene", partial(BagScene, image_size=32))
+    runs.bag_scene.cache_clear()
 
-    def load(name, *options):
+    def run(name, *options):
         spec = importlib.util.spec_from_file_location(name, Path(__file__).parents[1] / "scripts" / f"{name}.py")
         module = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
-        module.BagScene = partial(BagScene, image_size=32)
-        module.scene = cache(module.BagScene)
-        module.STEPS = STEPS
         monkeypatch.setattr(sys, "argv", [f"{name}.py", *options])
-        return module
+        module.main()
 
-    return load
+    yield run
+    runs.bag_scene.cache_clear()
 
 
 def test_policies_are_compared_operators_traced_and_the_demo_tells(script, filter_path, base_path, tmp_path, capsys):
-    policies = tmp_path / "policies.json"
-    options = [f"--weak={base_path}", "--filters", filter_path, "--laws", "margin", "--n=2", f"--output={policies}"]
-    script("bag_policies", *options, "--n_videos=1").main()
-    rows = json.loads(policies.read_text())
+    table = tmp_path / "policies.json"
+    options = [f"--weak={base_path}", "--filters", filter_path, "--laws", "margin", "--n=2", f"--output={table}"]
+    script("bag_policies", *options, "--n_videos=1")
+    rows = json.loads(table.read_text())
     cell = rows["weak"]["margin"][filter_path]
     assert rows["weak"]["bare"]["spilled"]["n"] == cell["spilled"]["n"] == 2 and rows["seeds"] == SEEDS
     assert cell["overridden_share"] == 1.0 and cell["median_first_override"] == 0
     assert rows["filters"] == {filter_path: {"epsilon": 2.0, "guard": 1, "release": -1.0}}
-    kept = policies.with_suffix(".jsonl").read_text()
-    script("bag_policies", *options).main()
-    assert policies.with_suffix(".jsonl").read_text() == kept  # nothing was run again
+    kept = table.with_suffix(".jsonl").read_text()
+    script("bag_policies", *options)
+    assert table.with_suffix(".jsonl").read_text() == kept  # nothing was run again
 
     for operator in ("closed_end", "open_end"):
         given = ["--laws", "margin", "--operators", operator, "--n=1", f"--output={tmp_path / operator}.json"]
-        script("bag_operators", "--filters", filter_path, *given).main()
+        script("bag_operators", "--filters", filter_path, *given)
     traces = json.loads((tmp_path / "closed_end.json").read_text())["closed_end"]["traces"]
     assert len(traces) == 1 and len(traces[0]["value"]) == STEPS
 
-    script("demo_bag").report(tmp_path, "margin", 90.0)
+    demo.report(tmp_path, "margin", 90.0)
     page, numbers = (tmp_path / "report.html").read_text(), json.loads((tmp_path / "metrics.json").read_text())
     assert page.count("<video") == 1 and page.count("<img") == 3 + PRINTED and "0/2 = 0.0%" in page
     assert numbers["the same, shielded"]["overridden_share"] == 1.0 and "1.5 minutes" in capsys.readouterr().out
-    for file in (policies, policies.with_suffix(".png"), *tmp_path.glob("videos/*.mp4")):  # without a policy
+    for file in (table, table.with_suffix(".png"), *tmp_path.glob("videos/*.mp4")):  # without a policy
         file.unlink()
-    script("demo_bag").report(tmp_path, "margin", 90.0)
+    demo.report(tmp_path, "margin", 90.0)
     assert (tmp_path / "report.html").read_text().count("<img") == 2
 
 
-def test_a_recording_is_replayed_on_every_variant(script, filter_path, tmp_path):
+def test_a_recording_is_replayed_on_every_variant(script, filter_path, tmp_path, monkeypatch):
     output = tmp_path / "out_of_distribution.json"
     options = ["--filters", filter_path, "--law=margin", "--n=1", f"--output={output}"]
-    module = script("bag_out_of_distribution", *options)
-    assert module.UNSEEN == ["green", "purple", "cloth", "stiff", "heavy"]
-    module.UNSEEN = ["heavy"]
-    module.main()
+    assert out_of_distribution.UNSEEN == ["green", "purple", "cloth", "stiff", "heavy"]
+    monkeypatch.setattr(out_of_distribution, "UNSEEN", ["heavy"])
+    out_of_distribution.recording.cache_clear()
+    script("bag_out_of_distribution", *options)
     rows = json.loads(output.read_text())
     assert rows["red"]["bare"]["spilled"]["k"] == 0 and rows["heavy"]["pooled"]["overridden_share"] == 1.0
     assert rows["law"] == "margin" and rows["filters"][filter_path]["guard"] == 1
-    assert len(module.recording(SEEDS[0])) == STEPS and output.with_suffix(".png").exists()
+    assert len(out_of_distribution.recording(SEEDS[0])) == STEPS and output.with_suffix(".png").exists()
 
 
 def test_a_command_that_fails_shows_the_end_of_its_log(tmp_path, capsys):
-    demo = Demo(tmp_path / "demo")
-    demo.run("greet: once", "python", "-c", "print('hello')")
+    shown = Demo(tmp_path / "demo")
+    shown.run("greet: once", "python", "-c", "print('hello')")
     assert (
         "hello" in (tmp_path / "demo" / "logs" / "greet.log").read_text() and "greet: once" in capsys.readouterr().out
     )
     with pytest.raises(SystemExit, match=r"(?s)'break' failed.*ZeroDivisionError"):
-        demo.run("break", "python", "-c", "1 / 0")
+        shown.run("break", "python", "-c", "1 / 0")

@@ -1,7 +1,7 @@
 """The privileged bound, lead times, and the table."""
 
+import importlib.util
 import json
-import runpy
 import sys
 from pathlib import Path
 
@@ -10,7 +10,7 @@ import pytest
 import tiny
 import torch
 
-from lerobot_latentsafe.experiments.blocks import study
+from lerobot_latentsafe.experiments.blocks import study, table2
 from lerobot_latentsafe.experiments.blocks.simulator_lookahead import SimulatorLookahead
 from lerobot_latentsafe.experiments.blocks.study import lead
 from lerobot_latentsafe.franka.behaviors import CLOSED, begin, reach, up
@@ -53,7 +53,7 @@ class Plucking:
     """In a policy's place, an operator who plucks the block, and puts it back if `back`."""
 
     def __init__(self, back):
-        self.scene, self.back = study._env().scene, back
+        self.scene, self.back = study.blocks_env().scene, back
 
     def reset(self):
         self.actions = self.pluck()
@@ -135,9 +135,12 @@ def test_the_table_is_written_and_goes_on_where_it_stopped(trained, tiny_dreamer
     ]  # fmt: skip
     monkeypatch.setattr(sys, "argv", arguments)
     monkeypatch.setattr(SimulatorLookahead.__init__, "__defaults__", (2,))  # its horizon
-    main = runpy.run_path(str(SCRIPT))["main"]
-    main.__globals__.update(EPSILONS=(0.4,), RISK_CURVE=(0.1,))
-    main()
+    monkeypatch.setattr(table2, "EPSILONS", (0.4,))
+    monkeypatch.setattr(table2, "RISK_CURVE", (0.1,))
+    spec = importlib.util.spec_from_file_location("blocks_table2", SCRIPT)
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    script.main()
     table = json.loads((results / "table2.json").read_text())
     assert set(table["methods"]) == {"dreamer", "sqrl_0.1", "sqrl_0.05", "latentsafe", "lookahead"}
     for row in table["methods"].values():
@@ -146,5 +149,5 @@ def test_the_table_is_written_and_goes_on_where_it_stopped(trained, tiny_dreamer
         assert sum(c["k"] for c in counts) == 2 and len(row["per_seed"]) == 1
     assert (results / "trade_off.png").exists() and len(table["curves"]) == 3
     made = cells.read_text()
-    main()
+    script.main()
     assert made == cells.read_text()

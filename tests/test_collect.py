@@ -10,6 +10,7 @@ from lerobot.utils.feature_utils import dataset_to_policy_features
 from lerobot_latentsafe.collection.dubins import SOURCES, WITH_POSITION, collect_dubins
 from lerobot_latentsafe.dubins import car
 from lerobot_latentsafe.dubins.ground_truth import exact_value
+from lerobot_latentsafe.envs.dubins_env import DubinsEnv
 
 
 def episodes(source, n=6, seed=0):
@@ -50,7 +51,7 @@ def test_images_are_what_the_environment_shows(dataset_root, recorded):
     dataset = LeRobotDataset(tiny.REPO_ID, root=dataset_root)
     states = np.concatenate([e.states for e in recorded])
     for i in (0, len(states) // 2):
-        env = car.DubinsEnv()
+        env = DubinsEnv()
         seen, _ = env.reset(options={"state": states[i]})
         stored = (dataset[i]["observation.image"] * 255).round().numpy().astype(np.uint8)
         np.testing.assert_array_equal(stored.transpose(1, 2, 0), seen["pixels"])
@@ -143,6 +144,6 @@ def test_unknown_source_lists_the_known_ones(tmp_path):
 
 def test_existing_folder_is_left_alone(tmp_path):
     (tmp_path / "precious").write_text("data")
-    with pytest.raises(FileExistsError, match="another --root"):
+    with pytest.raises(FileExistsError, match=r"another --dataset\.root"):
         collect_dubins("random", "me/x", tmp_path, 1, 0)
     assert (tmp_path / "precious").read_text() == "data"

@@ -9,7 +9,7 @@ from tiny import save_franka_filter
 from lerobot_latentsafe.collection import franka
 from lerobot_latentsafe.collection.franka import SOURCES, Source
 from lerobot_latentsafe.collection.franka import collect_franka as collect
-from lerobot_latentsafe.collection.interventions import BRIEF, RETREATING, Interruptions
+from lerobot_latentsafe.collection.interventions import BRIEF, RETREATING, Interventions
 from lerobot_latentsafe.datasets.labels import FailureLabels
 from lerobot_latentsafe.franka.actions import action_limits
 
@@ -119,8 +119,12 @@ class Closes:
     up = 0.9
     """More than the limits allow."""
 
-    def __init__(self, path, device):
+    def __init__(self):
         self.executed = []
+
+    @classmethod
+    def load(cls, path):
+        return cls()
 
     def reset(self):
         self.steps = 0
@@ -141,7 +145,7 @@ def test_a_policy_is_recorded_as_it_acts_and_is_overridden(tiny, monkeypatch):
 
     monkeypatch.setattr(policy_operator, "BasePolicy", Closes)
     franka._policy_operator.cache_clear()
-    source = Source("blocks", {"closes": 2}, policies=True, hand=BRIEF, seconds=3.0)
+    source = Source("blocks", {"closes": 2}, policies=True, style=BRIEF, seconds=3.0)
     with LatentSafeFrankaMujoco(LatentSafeFrankaMujocoConfig(scene="blocks", image_size=32)) as robot:
         runs = [list(franka.episode_frames(robot, source, episode, 0)) for episode in (0, 0, 1)]
     operator = franka._policy_operator("closes", 20, BRIEF, None)
@@ -164,11 +168,11 @@ def test_a_filter_may_say_when(tiny, tmp_path, monkeypatch):
     from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
 
     monkeypatch.setattr(Closes, "up", 0.01)
-    monkeypatch.setattr(LatentSafePolicy, "attach", lambda self, path: setattr(self, "_base", [Closes(path, "cpu")]))
-    hand = replace(RETREATING, steps=(2, 4), down=1.0)
+    monkeypatch.setattr(LatentSafePolicy, "attach", lambda self, path: setattr(self, "_base", [Closes()]))
+    style = replace(RETREATING, steps=(2, 4), down=1.0)
     for epsilon, passes in ((2.0, False), (-2.0, True)):
-        path = str(save_franka_filter(tmp_path / str(epsilon), epsilon=epsilon))
-        source = Source("blocks", {"closes": 1}, policies=True, hand=hand, shield=path, seconds=1.0)
+        path = str(save_franka_filter(tmp_path / str(epsilon), law_epsilon=epsilon))
+        source = Source("blocks", {"closes": 1}, policies=True, style=style, shield=path, seconds=1.0)
         with LatentSafeFrankaMujoco(LatentSafeFrankaMujocoConfig(scene="blocks", image_size=32)) as robot:
             frames = list(franka.episode_frames(robot, source, 0, 0))
         actions = np.stack([frame["action"] for frame in frames])
@@ -176,44 +180,44 @@ def test_a_filter_may_say_when(tiny, tmp_path, monkeypatch):
         assert lowered[0] != passes and not (passes and lowered.any())
         assert (actions[lowered, 2] < 0).all() and (actions[~lowered, 2] == np.float32(0.01)).all()
         # What was done instead is told to the policy, and to the filter, which remembers it.
-        operator = franka._policy_operator("closes", 20, hand, path)
+        operator = franka._policy_operator("closes", 20, style, path)
         np.testing.assert_allclose(np.reshape(operator.policy.executed, (-1, 7)), actions[lowered], atol=1e-6)
-        executed = operator.filter.denormalise_action(operator.filter.shield.executed)[0]
+        executed = operator.filter.model.units.denormalise_action(operator.filter.shield.executed)[0]
         np.testing.assert_allclose(executed.numpy(), actions[-1], atol=1e-5)
     franka._policy_operator.cache_clear()
 
 
-def test_an_operator_is_interrupted_while_the_fingers_close_and_goes_on(tiny):
+def test_somebody_intervenes_while_the_fingers_close_and_the_operator_goes_on(tiny):
     from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
     from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
 
     actions = {}
-    for hand in (None, RETREATING):
-        source = Source("bag", {"open_end": 1}, hand=hand, seconds=8.0)
+    for style in (None, RETREATING):
+        source = Source("bag", {"open_end": 1}, style=style, seconds=8.0)
         with LatentSafeFrankaMujoco(LatentSafeFrankaMujocoConfig(scene="bag", image_size=32)) as robot:
             frames = list(franka.episode_frames(robot, source, 3, 0))
-        actions[hand] = np.stack([frame["action"] for frame in frames])
-    alone, interrupted = actions.values()
-    differs = np.abs(alone - interrupted).max(1) > 0
+        actions[style] = np.stack([frame["action"] for frame in frames])
+    alone, intervened = actions.values()
+    differs = np.abs(alone - intervened).max(1) > 0
     assert differs.any() and not differs[: np.argmax(alone[:, 6] < 0.5) + 1].any()
-    first = interrupted[np.argmax(differs)]
+    first = intervened[np.argmax(differs)]
     limits = action_limits(15)
     assert (first[[0, 1, 3, 4, 5]] == 0).all() and 0.5 * limits[0][2] - 1e-6 <= first[2] <= 0 and first[6] < 0.5
 
 
-def test_interruptions_last_as_long_and_go_as_fast_as_they_are_asked_to():
+def test_interventions_last_as_long_and_go_as_fast_as_they_are_asked_to():
     limits, action = action_limits(15), np.array([0.001, 0, 0.01, 0, 0, 0, 0.0])
-    interruptions = Interruptions(RETREATING, limits, np.random.default_rng(0))
-    assert not interruptions(action)[1]  # fingers that were open
-    taken = [interruptions(action) for _ in range(20_000)]
-    speeds = np.array([executed[2] / limits[0][2] for executed, interrupted in taken if interrupted])
+    interventions = Interventions(RETREATING, limits, np.random.default_rng(0))
+    assert not interventions(action)[1]  # fingers that were open
+    taken = [interventions(action) for _ in range(20_000)]
+    speeds = np.array([executed[2] / limits[0][2] for executed, intervened in taken if intervened])
     held = speeds == 0
     assert 0.2 < held.mean() < 0.4
     assert speeds[~held].min() >= 0.15 and speeds.max() <= 0.5
-    flags = "".join(str(int(interrupted)) for _, interrupted in taken)
+    flags = "".join(str(int(intervened)) for _, intervened in taken)
     lengths = [len(run) for run in flags.split("0") if run]
     assert min(lengths) == 3 and max(lengths) == 39
-    passed = [executed for executed, interrupted in taken if not interrupted]
+    passed = [executed for executed, intervened in taken if not intervened]
     assert all((executed == action).all() for executed in passed)
 
 
@@ -231,7 +235,7 @@ def test_bad_requests_are_refused(tiny, tmp_path):
     with pytest.raises(ValueError, match="--workers is 0; expected at least 1"):
         collect("tiny", "me/x", tmp_path / "x", 1, 0, workers=0)
     (tmp_path / "precious").write_text("data")
-    with pytest.raises(FileExistsError, match="another --root"):
+    with pytest.raises(FileExistsError, match=r"another --dataset\.root"):
         collect("tiny", "me/x", tmp_path, 1, 0)
     parts = tmp_path / "mine.parts"
     parts.mkdir()

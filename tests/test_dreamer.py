@@ -15,14 +15,19 @@ from safetensors.torch import load_file
 from test_hub import hub  # noqa: F401
 
 from lerobot_latentsafe.base_policy import BasePolicy
+from lerobot_latentsafe.cli.deploy import Push
+from lerobot_latentsafe.cli.options import PolicySource
+from lerobot_latentsafe.decision import LawOptions
 from lerobot_latentsafe.experiments.blocks import recorders
 from lerobot_latentsafe.experiments.blocks.dreamer_training import DreamerTraining, TrainDreamer
 from lerobot_latentsafe.experiments.blocks.replay import CAMERA_KEYS, Replay
 from lerobot_latentsafe.experiments.blocks.study import world_model_of
 from lerobot_latentsafe.franka.actions import STATE_NAMES, action_limits
-from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, UntrainedFilterError
+from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
 from lerobot_latentsafe.policies.dreamer.modeling_dreamer import LatentSafeDreamerPolicy, WorldModelMismatchError
-from lerobot_latentsafe.runtime.checkpoint import CheckpointError, halve_weights
+from lerobot_latentsafe.runtime.checkpoint import CheckpointError
+from lerobot_latentsafe.runtime.hub import halve_weights
+from lerobot_latentsafe.safety_model import UntrainedFilterError
 from lerobot_latentsafe.training import train_reachability
 
 
@@ -61,7 +66,7 @@ def test_actions_that_are_drawn_far_out_of_range_are_executed_and_remembered_cli
     task_policy.reset()
     action = task_policy.act(observation(), explore=True)
     torch.testing.assert_close(task_policy.executed, torch.ones(2, 7))
-    torch.testing.assert_close(action, task_policy.model.denormalise_action(torch.ones(2, 7)))
+    torch.testing.assert_close(action, task_policy.model.units.denormalise_action(torch.ones(2, 7)))
 
 
 def test_a_hand_that_is_led_astray_goes_there_for_some_steps_and_the_policy_remembers(task_policy):
@@ -70,7 +75,7 @@ def test_a_hand_that_is_led_astray_goes_there_for_some_steps_and_the_policy_reme
         explore = recorders._Exploring(task_policy, rng)
         for t in range(60):
             action = torch.from_numpy(explore(observation(1, seed=t)))
-            torch.testing.assert_close(task_policy.model.denormalise_action(task_policy.executed), action)
+            torch.testing.assert_close(task_policy.model.units.denormalise_action(task_policy.executed), action)
             yield explore.straying and explore.straying.left, action
 
     left, action = zip(*acts(np.random.default_rng(1)))
@@ -229,7 +234,7 @@ def test_what_was_meant_is_imitated_not_what_was_done(trained):
     run = DreamerTraining(tiny.dreamer_options(trained))
     run.step = 0
     _, meant, *_ = run._batch()
-    every = run.policy.model.normalise_action(torch.from_numpy(np.array(run.replay.arrays["meant"]))).clamp(-1, 1)
+    every = run.policy.model.units.normalise_action(torch.from_numpy(np.array(run.replay.arrays["meant"]))).clamp(-1, 1)
     for row in meant:
         windows = every.unfold(0, 3, 1)  # (N, A, 3)
         assert (windows - row[:3].T).abs().amax((1, 2)).min() < 1e-6
@@ -286,7 +291,7 @@ def test_a_policy_may_share_the_world_model_of_another_checkpoint(task_policy, t
 
 
 def test_lerobot_makes_it_by_its_type(trained):
-    base = BasePolicy(trained / "policy", "cpu")
+    base = BasePolicy.load(trained / "policy")
     assert base.config.type == "latentsafe_dreamer"
     base.reset()
     assert base.propose(observation()).shape == (2, 7)
@@ -308,10 +313,10 @@ def test_history_matters_until_reset(task_policy):
 def test_overridden_action_is_remembered(task_policy):
     task_policy.reset()
     action = task_policy.select_action(observation())
-    torch.testing.assert_close(task_policy.model.denormalise_action(task_policy.executed), action)
+    torch.testing.assert_close(task_policy.model.units.denormalise_action(task_policy.executed), action)
     other = torch.zeros(2, 7)
     task_policy.was_overridden(other)
-    expected = task_policy.model.normalise_action(other).clamp(-1, 1)
+    expected = task_policy.model.units.normalise_action(other).clamp(-1, 1)
     torch.testing.assert_close(task_policy.executed, expected)
 
 
@@ -327,8 +332,8 @@ def test_world_model_of_something_else_is_refused(trained, name, value, tmp_path
 
 
 def test_filter_of_another_task_does_not_shield_it(trained, tmp_path):
-    tiny.save_franka_filter(tmp_path / "filter", task="lift the bag")
-    filter = LatentSafePolicy.from_pretrained(tmp_path / "filter")
+    tiny.save_franka_filter(tmp_path / "filter", trained_on_task="lift the bag")
+    filter = load_filter(tmp_path / "filter")
     with pytest.raises(ValueError, match=r"has task = pluck the green block.*, the filter lift the bag"):
         filter.attach(trained / "policy")
 
@@ -354,14 +359,14 @@ def test_from_nothing_it_says_how_to_train_one(task_policy):
 
 def test_filter_is_trained_on_its_world_model_and_shields_it(trained, tmp_path):
     from lerobot_latentsafe import LatentSafeBlocksEnv
-    from lerobot_latentsafe.evaluation.statistics import compare
+    from lerobot_latentsafe.evaluation.rollouts import compare
 
     episodes = tiny.metadata(trained / "episodes", "local/blocks_dreamer")
     assert episodes.total_episodes == 2 + 2 * 2
     policy = train_reachability(trained / "policy" / "world_model", episodes, tmp_path / "filter")
     policy.attach(trained / "policy")
     env = LatentSafeBlocksEnv()
-    policy.config.epsilon = 2.0
+    policy.config.change(law=policy.config.law.changed(LawOptions(epsilon=2.0)))
     result = compare(policy, env, 2, seed=0)
     assert result["shielded"]["overridden_share"] == 1
 
@@ -376,8 +381,6 @@ def test_exported_episodes_are_the_replay(trained):
 
 
 def test_pulled_policy_acts_as_the_pushed_one(hub, task_policy, trained):  # noqa: F811
-    from lerobot_latentsafe.commands import PolicySource, Push
-
     Push(policy=PolicySource(str(trained / "policy")), repo_id="me/dreamer", dataset_repo_id="me/blocks").run()
     assert "world_model/model.safetensors" in hub.repos["me/dreamer"]
     assert "fails at times, on purpose" in hub.repos["me/dreamer"]["README.md"].decode()

@@ -7,6 +7,7 @@ from lerobot.envs import make_env, preprocess_observation
 from lerobot_latentsafe import LatentSafeDubinsEnv
 from lerobot_latentsafe.dubins import car
 from lerobot_latentsafe.dubins.ground_truth import exact_value
+from lerobot_latentsafe.envs.dubins_env import DubinsEnv
 
 
 def command(turn_rate=0.0):
@@ -98,10 +99,10 @@ def test_other_sizes(size):
 # -- environment ---
 
 
-@pytest.mark.parametrize("variant", car.DubinsEnv.variants)
+@pytest.mark.parametrize("variant", DubinsEnv.variants)
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_env_follows_the_gymnasium_api(variant):
-    check_env(car.DubinsEnv(variant), skip_render_check=True)
+    check_env(DubinsEnv(variant), skip_render_check=True)
 
 
 def test_env_is_registered():
@@ -110,7 +111,7 @@ def test_env_is_registered():
 
 
 def test_equal_seeds_give_equal_starts():
-    first, second = car.DubinsEnv(), car.DubinsEnv("discrete")
+    first, second = DubinsEnv(), DubinsEnv("discrete")
     for seed in range(3):
         observation, info = first.reset(seed=seed)
         other, other_info = second.reset(seed=seed)
@@ -119,15 +120,15 @@ def test_equal_seeds_give_equal_starts():
     assert not np.array_equal(first.reset(seed=0)[1]["state"], first.reset(seed=1)[1]["state"])
 
 
-@pytest.mark.parametrize("variant", car.DubinsEnv.variants)
+@pytest.mark.parametrize("variant", DubinsEnv.variants)
 def test_every_start_can_be_kept_safe(variant):
-    env = car.DubinsEnv(variant)
+    env = DubinsEnv(variant)
     states = np.array([env.reset(seed=seed)[1]["state"] for seed in range(10)])
     assert (exact_value(states) > 0).all()
 
 
 def test_discrete_variant_snaps_to_three_turn_rates():
-    env = car.DubinsEnv("discrete")
+    env = DubinsEnv("discrete")
     for asked, taken in ((0.6, 0.0), (0.7, 1.25), (-9.0, -1.25)):
         env.reset(seed=0, options={"state": (-0.9, 0.0, 0.0)})
         env.step(command(asked))
@@ -135,7 +136,7 @@ def test_discrete_variant_snaps_to_three_turn_rates():
 
 
 def test_continuous_variant_takes_any_turn_rate_within_limits():
-    env = car.DubinsEnv()
+    env = DubinsEnv()
     for asked, taken in ((0.6, 0.6), (3.0, 1.25)):
         env.reset(seed=0, options={"state": (-0.9, 0.0, 0.0)})
         env.step(command(asked))
@@ -143,7 +144,7 @@ def test_continuous_variant_takes_any_turn_rate_within_limits():
 
 
 def test_speed_is_held_whatever_is_asked():
-    env = car.DubinsEnv()
+    env = DubinsEnv()
     env.reset(options={"state": (-0.9, 0.0, 0.0)})
     env.step(np.array([0.0, 7.0]))
     assert env.state[0] == pytest.approx(-0.9 + car.DT * car.SPEED)
@@ -151,26 +152,26 @@ def test_speed_is_held_whatever_is_asked():
 
 def test_unknown_variant_lists_the_known_ones():
     with pytest.raises(ValueError, match=r"'sideways'.*continuous, discrete, anywhere"):
-        car.DubinsEnv("sideways")
+        DubinsEnv("sideways")
 
 
 @pytest.mark.parametrize("action", [[np.nan, 1.0], [0.0, np.inf], [0.0], [0.0, 1.0, 0.0], []])
 def test_bad_action_is_refused(action):
-    env = car.DubinsEnv()
+    env = DubinsEnv()
     env.reset(seed=0)
     with pytest.raises(ValueError, match="expected a finite turn rate"):
         env.step(np.array(action))
 
 
 def test_success_is_arriving_without_a_violation():
-    env = car.DubinsEnv()
+    env = DubinsEnv()
     env.reset(options={"state": (0.87, 0.8, 0.0)})
     _, reward, terminated, truncated, info = env.step(command())
     assert (reward, terminated, truncated, info["is_success"], info["failure"]) == (1.0, True, False, True, False)
 
 
 def test_a_violation_is_remembered_and_rules_success_out():
-    env = car.DubinsEnv()
+    env = DubinsEnv()
     env.reset(options={"state": (0.0, 0.45, 0.0)})
     violated, over = [], False
     while not over:
@@ -183,14 +184,14 @@ def test_a_violation_is_remembered_and_rules_success_out():
 
 
 def test_leaving_the_view_ends_without_success():
-    env = car.DubinsEnv()
+    env = DubinsEnv()
     env.reset(options={"state": (-1.08, 0.0, np.pi)})
     _, reward, terminated, truncated, info = env.step(command())
     assert terminated and not truncated and reward == 0.0 and not info["is_success"]
 
 
 def test_episode_is_truncated_at_its_length():
-    env = car.DubinsEnv(episode_length=3)
+    env = DubinsEnv(episode_length=3)
     env.reset(options={"state": (-0.9, 0.8, 0.0)})
     assert [env.step(command())[3] for _ in range(3)] == [False, False, True]
 

@@ -1,24 +1,23 @@
-"""The script behind the curve of margin quality against labels: its rounds, and what it calls all labels."""
+"""The study behind the curve of margin quality against labels: its rounds, and what it calls all labels."""
 
-import runpy
+from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
 
+from lerobot_latentsafe.experiments import label_curve
 from lerobot_latentsafe.training import fit_margin, load_with_cache
 
 
 @pytest.fixture(scope="module")
 def study(tiny_world_model, cache_meta):
-    script = runpy.run_path(str(Path(__file__).parents[1] / "scripts" / "label_curve.py"))
-    made = script["Study"]
-    names = made.__init__.__globals__
-    names |= {"BLOCK": 1, "fit_margin": partial(fit_margin, steps=30)}  # 14 episodes only
     policy, reader = load_with_cache(tiny_world_model, cache_meta)
-    policy.config.margin_clips = 128
-    return made(policy, reader)
+    policy.config.change(margin=replace(policy.config.margin, clips=128))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(label_curve, "BLOCK", 1)  # 14 episodes only
+        patch.setattr(label_curve, "fit_margin", partial(fit_margin, steps=30))
+        yield label_curve.Study(policy.model, reader)
 
 
 def test_held_out_episodes_are_never_labelled(study):

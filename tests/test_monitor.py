@@ -1,13 +1,16 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import tiny
 import torch
 
+from lerobot_latentsafe.decision import LawOptions
 from lerobot_latentsafe.dubins import car
 from lerobot_latentsafe.dubins.ground_truth import exact_value
 from lerobot_latentsafe.evaluation.statistics import confusion, provenance, wilson, write_json
+from lerobot_latentsafe.experiments.dubins.figures import value_slices
 from lerobot_latentsafe.experiments.dubins.monitor import (
     LatentMonitor,
     PlanMonitor,
@@ -16,7 +19,9 @@ from lerobot_latentsafe.experiments.dubins.monitor import (
     feasible_starts,
     safe_policy_rollouts,
 )
-from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, UntrainedFilterError
+from lerobot_latentsafe.modeling_latentsafe import load_filter
+from lerobot_latentsafe.reports.figures import save
+from lerobot_latentsafe.safety_model import UntrainedFilterError
 
 STATES = np.random.default_rng(0).uniform([-1.1, -1.1, -np.pi], [1.1, 1.1, np.pi], (20, 3))
 
@@ -37,7 +42,7 @@ class ExactMonitor:
 
 @pytest.fixture(scope="module")
 def latent(tiny_filter):
-    return LatentMonitor(LatentSafePolicy.from_pretrained(tiny_filter), chunk=8)
+    return LatentMonitor(load_filter(tiny_filter).model, chunk=8)
 
 
 # -- the numbers ---
@@ -158,7 +163,7 @@ def test_learned_monitors_run(latent, kind):
 
 
 def test_value_does_not_depend_on_the_chunk(latent):
-    whole = LatentMonitor(latent.policy, chunk=2048)
+    whole = LatentMonitor(latent.model, chunk=2048)
     np.testing.assert_allclose(latent.value(STATES), whole.value(STATES), atol=1e-5)
 
 
@@ -172,7 +177,7 @@ def test_plan_does_not_look_beyond_the_end_of_the_episode(latent, monkeypatch):
     one_step = PlanMonitor(latent, horizon=1).value(STATES)
     assert not np.allclose(PlanMonitor(latent, horizon=8).value(STATES), one_step)
     over = lambda z: torch.ones(len(z["h"]), dtype=torch.bool)  # noqa: E731
-    monkeypatch.setattr(latent.policy.world_model, "ended", over)
+    monkeypatch.setattr(latent.model.world_model, "ended", over)
     np.testing.assert_allclose(PlanMonitor(latent, horizon=8).value(STATES), one_step, atol=1e-6)
 
 
@@ -183,37 +188,33 @@ def test_fallback_remembers_within_a_rollout_only(latent):
     np.testing.assert_array_equal(latent.start()(STATES), first)
 
 
-def test_monitor_sees_what_the_shield_sees(latent):
+def test_monitor_sees_what_the_shield_sees(latent, policy):
     """The second frame of a straight drive gives the same latent in deployment."""
-    policy = latent.policy
     heading = STATES[:, 2]
     before = STATES.copy()
     before[:, :2] -= car.DT * np.stack([np.cos(heading), np.sin(heading)], -1)
-    policy.config.epsilon, policy.config.mode = 0.0, "monitor"
+    policy.config.change(law=policy.config.law.changed(LawOptions(epsilon=0.0, mode="monitor")))
     policy.reset()
-    straight = policy.hold_action(20)
+    straight = policy.model.units.hold_action(20)
     for states in (before, STATES):
         policy.shield(tiny.observation(states), straight)
-    policy.config.mode = "filter"
     for key, value in latent.latent(STATES).items():
         np.testing.assert_allclose(policy.shield.latent[key], value, atol=1e-5)
 
 
 def test_value_slices_are_drawn(latent, tmp_path):
-    from lerobot_latentsafe.reports import figures
-
-    figure = figures.value_slices({"latent": latent, "exact": ExactMonitor()}, n=9)
+    figure = value_slices({"latent": latent, "exact": ExactMonitor()}, n=9)
     assert len(figure.axes) == 8  # two headings and their colour bars, for each monitor
-    figures.save(figure, tmp_path / "slices.png")
+    save(figure, tmp_path / "slices.png")
     assert (tmp_path / "slices.png").stat().st_size > 1000
 
 
 def test_filter_without_a_critic_is_no_monitor(tiny_world_model):
     with pytest.raises(UntrainedFilterError):
-        LatentMonitor(LatentSafePolicy.from_pretrained(tiny_world_model))
+        LatentMonitor(load_filter(tiny_world_model).model)
 
 
 def test_filter_of_another_rate_is_no_monitor_of_the_car(policy):
-    policy.config.fps = 15
+    policy.config.change(trained_on=replace(policy.config.trained_on, fps=15))
     with pytest.raises(ValueError, match=r"trained at 15 fps.*runs at 20 fps"):
-        LatentMonitor(policy)
+        LatentMonitor(policy.model)

@@ -11,13 +11,13 @@ from safetensors.torch import load_file, save_file
 from lerobot_latentsafe.base_policy import BasePolicy
 from lerobot_latentsafe.datasets.frame_cache import FrameCache, FrameCacheError
 from lerobot_latentsafe.dubins.car import ACTION_NAMES, STATE_NAMES
+from lerobot_latentsafe.encoders.perception import EncoderMismatchError
 from lerobot_latentsafe.policies import grasp_prediction
-from lerobot_latentsafe.policies.grasp_prediction import (
+from lerobot_latentsafe.policies.grasp_prediction import GraspPredictionStep, GraspPredictor, TwoValuedStep
+from lerobot_latentsafe.policies.grasp_training import (
     AIM,
-    Aim,
-    PerceiveStep,
-    TwoValuedStep,
     check_seen,
+    foreseen,
     let_see,
     two_valued,
     until_switched,
@@ -79,7 +79,7 @@ def test_what_is_learnt_of_an_object_in_some_places_holds_in_others():
     tokens = torch.randn(36, 36, 4) * 0.05
     tokens[patches, patches, 1] += 3
     torch.manual_seed(0)
-    aim, state = Aim(1, 36, 4, state_dim=1, n_moves=2), torch.zeros(36, 1)
+    aim, state = GraspPredictor(1, 36, 4, state_dim=1, n_moves=2), torch.zeros(36, 1)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(grasp_prediction, "STEPS", 400)
         aim.fit(tokens[shown], state[shown], places[shown])
@@ -90,10 +90,10 @@ def test_what_is_learnt_of_an_object_in_some_places_holds_in_others():
 
 def test_live_observation_is_seen_as_in_training(seeing, token_root, dataset_root):
     item = LeRobotDataset(tiny.REPO_ID, root=dataset_root)[7]
-    base = BasePolicy(seeing, "cpu")
+    base = BasePolicy.load(seeing)
     batch = {key: item[key][None] for key in ("observation.image", "observation.state")}
     view = base.preprocessor(dict(batch))[OBS_ENV_STATE]
-    aim = next(step.aim for step in base.preprocessor.steps if isinstance(step, PerceiveStep))
+    aim = next(step.aim for step in base.preprocessor.steps if isinstance(step, GraspPredictionStep))
     percepts, state = FrameCache.open(token_root).frames(np.array([7]), ["tokens"])
     moves = aim(percepts["tokens"], state)
     torch.testing.assert_close(view, aim.in_detail(moves), rtol=1e-2, atol=1e-2)  # the cache holds 16 bits
@@ -103,16 +103,16 @@ def test_live_observation_is_seen_as_in_training(seeing, token_root, dataset_roo
 def test_a_policy_learns_from_aims_of_a_network_that_did_not_learn_from_them(seen, token_root):
     dataset, cache = LeRobotDataset(f"{REPO_ID}_seen", root=seen.root), FrameCache.open(token_root)
     percepts, state = cache.frames(np.arange(len(dataset)), ["tokens"])
-    aim = Aim(1, *percepts["tokens"].shape[1:], state.shape[1], n_moves=2)
-    aim.load_state_dict(load_file(seen.root / grasp_prediction.AIM))
+    aim = GraspPredictor(1, *percepts["tokens"].shape[1:], state.shape[1], n_moves=2)
+    aim.load_state_dict(load_file(seen.root / AIM))
     column = torch.from_numpy(np.stack(dataset.hf_dataset.with_format("numpy")[OBS_ENV_STATE]))
-    by_one_that_did = aim.in_detail(grasp_prediction.foreseen(aim.eval(), percepts["tokens"], state))
+    by_one_that_did = aim.in_detail(foreseen(aim.eval(), percepts["tokens"], state))
     assert column.shape == by_one_that_did.shape
     assert not torch.isclose(column, by_one_that_did, rtol=1e-2).all(1).any()
 
 
 def test_small_motions_are_told_apart_where_large_ones_saturate():
-    aim = Aim(1, 36, 4, state_dim=1, n_moves=1)  # its motions have a deviation of 1
+    aim = GraspPredictor(1, 36, 4, state_dim=1, n_moves=1)  # its motions have a deviation of 1
     shown = aim.in_detail(torch.tensor([[0.0], [0.1], [2.0], [3.0], [-3.0]]))
     torch.testing.assert_close(shown[:, 0], torch.tensor([0.0, 0.1, 2.0, 3.0, -3.0]))
     torch.testing.assert_close(shown[:, 1], torch.tensor([0.0, 0.4621, 1.0, 1.0, -1.0]), atol=1e-3, rtol=0)
@@ -135,7 +135,7 @@ def test_commands_of_two_values_are_given_as_the_nearer_one():
 
 def test_missing_camera_is_named(seeing):
     with pytest.raises(KeyError, match=r"lacks observation\.image"):
-        BasePolicy(seeing, "cpu").propose({"observation.state": torch.zeros(1, 2)})
+        BasePolicy.load(seeing).propose({"observation.state": torch.zeros(1, 2)})
 
 
 def test_existing_folder_is_left_alone(seeing, seen, token_root):
@@ -151,5 +151,5 @@ def test_aims_of_another_dataset_are_refused(seen, token_root, tmp_path):
 
 
 def test_pictures_are_no_views(cache_root, tmp_path):
-    with pytest.raises(FrameCacheError, match="holds pictures"):
+    with pytest.raises(EncoderMismatchError, match="holds pictures"):
         with_aim(cache_root, REPO_ID, tmp_path / "seen", **AIMED)

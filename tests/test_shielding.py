@@ -3,13 +3,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import tiny
 from lerobot.configs.types import FeatureType, PolicyFeature
 
 from lerobot_latentsafe import LatentSafeDubinsEnv
-from lerobot_latentsafe.decision import Reason
-from lerobot_latentsafe.evaluation.statistics import Episodes, check_environment, compare, run_episodes
-from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+from lerobot_latentsafe.decision import LawOptions, Reason
+from lerobot_latentsafe.dubins.car import step as car_step
+from lerobot_latentsafe.envs import dubins_env
+from lerobot_latentsafe.evaluation.rollouts import Episodes, check_environment, compare, run_episodes
+from lerobot_latentsafe.experiments.dubins.figures import trajectories
+from lerobot_latentsafe.modeling_latentsafe import load_filter
 
 N, LENGTH = 4, 12
 
@@ -20,9 +22,7 @@ def car(**changes):
 
 @pytest.fixture(scope="module")
 def shielded(tiny_filter, tiny_diffusion):
-    policy = LatentSafePolicy.from_pretrained(tiny_filter)
-    policy.attach(tiny_diffusion)
-    return policy
+    return load_filter(tiny_filter, base_policy=tiny_diffusion)
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def test_bare_and_shielded_start_from_the_same_states(result):
 
 
 def test_starts_are_those_of_the_seeds(result, shielded):
-    env = tiny.dubins.DubinsEnv()
+    env = dubins_env.DubinsEnv()
     starts = [env.reset(seed=seed)[1]["state"] for seed in range(N)]
     np.testing.assert_allclose([t["state"][0] for t in result["episodes"]["bare"].traces], starts)
     later = run_episodes(shielded.base, car(episode_length=1), 1, seed=2)
@@ -77,12 +77,13 @@ def test_frames_are_kept_of_the_episodes_asked_for(result):
 def test_traced_actions_lead_from_state_to_state(result):
     for trace in result["episodes"]["shielded"].traces:
         states, rates = np.array(trace["state"]), np.array(trace["action"])[:, 0]
-        np.testing.assert_allclose(tiny.dubins.step(states[:-1], rates), states[1:], atol=1e-5)
+        np.testing.assert_allclose(car_step(states[:-1], rates), states[1:], atol=1e-5)
 
 
 @pytest.mark.parametrize(("epsilon", "share"), [(-math.inf, 0.0), (math.inf, 1.0)])
 def test_extreme_epsilons_override_nothing_or_all(shielded, monkeypatch, epsilon, share):
-    monkeypatch.setattr(shielded.config, "epsilon", epsilon)
+    law = shielded.config.law.changed(LawOptions(epsilon=epsilon))
+    monkeypatch.setattr(shielded.config, "law", law)
     row = compare(shielded, car(), 2, seed=0)
     assert row["shielded"]["overridden_share"] == share
     if share == 0.0:
@@ -116,9 +117,9 @@ def test_outcomes_by_hand():
 
 def test_a_violation_counts_even_when_the_goal_is_reached(shielded, monkeypatch):
     """Straight through the disc, and on to the right edge."""
-    straight = shielded.hold_action(1)
+    straight = shielded.model.units.hold_action(1)
     monkeypatch.setattr(shielded.base, "propose", lambda _: straight)
-    monkeypatch.setattr("lerobot_latentsafe.dubins.car.sample_task_start", lambda _: np.array([-0.9, 0.0, 0.0]))
+    monkeypatch.setattr(dubins_env, "sample_task_start", lambda _: np.array([-0.9, 0.0, 0.0]))
     episodes = run_episodes(shielded.base, car(episode_length=80), 1, seed=0)
     assert episodes.violation.all() and not episodes.success.any()
     assert episodes.traces[0]["state"][-1][0] > 0.899
@@ -152,7 +153,7 @@ def test_figures_and_videos_are_written(result, tmp_path):
     from lerobot_latentsafe.reports import figures
 
     episodes = result["episodes"]
-    figures.save(figures.trajectories(episodes), tmp_path / "new" / "trajectories.png")
+    figures.save(trajectories(episodes), tmp_path / "new" / "trajectories.png")
     spilled = {"bare": replace(episodes["bare"], severity=np.array([0.0, 0.04, 0.5, 1.0]))}
     figures.save(figures.severities(spilled), tmp_path / "severities.png")
     figures.save(figures.value_trace(episodes["shielded"].traces[0], 0.0), tmp_path / "trace.png")

@@ -1,6 +1,8 @@
 """SQRL: the same learner with another target, and a filter that never takes one value for the other."""
 
+import json
 import math
+import shutil
 
 import draccus
 import pytest
@@ -10,8 +12,11 @@ from test_reachability import CHAIN, WindyChain
 
 from lerobot_latentsafe.configuration_latentsafe import CriticTargetError
 from lerobot_latentsafe.critic import SafetyCritic, risk_bellman_target
+from lerobot_latentsafe.decision import LawOptions
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.reachability import LatentReachability
+from lerobot_latentsafe.runtime.checkpoint import CheckpointError
+from lerobot_latentsafe.safety_model import SafetyModel
 from lerobot_latentsafe.training import train_reachability
 
 
@@ -65,7 +70,8 @@ def risk_filter(tiny_world_model, cache_meta, tmp_path_factory):
 
 def test_trained_target_is_kept_and_read_as_risk(risk_filter):
     policy = LatentSafePolicy.from_pretrained(risk_filter)
-    assert policy.config.target == policy.config.law == "risk" and policy.config.lookahead == 0
+    law = policy.config.law
+    assert policy.config.trained_on.target == law.name == "risk" and law.lookahead == 0
     for decision in tiny.drive(policy):
         assert (decision.value >= -1).all() and (decision.value <= 0).all()
 
@@ -74,23 +80,24 @@ def test_law_intervenes_at_the_threshold_of_risk(risk_filter, tiny_diffusion, mo
     policy = LatentSafePolicy.from_pretrained(risk_filter)
     policy.attach(tiny_diffusion)
     # Margins are positive, and the fallback's risk is 0.3 everywhere.
-    monkeypatch.setattr(type(policy.margin), "bounded", lambda self, z: torch.full(z.shape[:-1], 0.5))
-    monkeypatch.setattr(policy.critic, "best_q", lambda x: torch.full(x.shape[:-1], -0.3))
+    monkeypatch.setattr(type(policy.model.margin), "bounded", lambda self, z: torch.full(z.shape[:-1], 0.5))
+    monkeypatch.setattr(policy.model.critic, "best_q", lambda x: torch.full(x.shape[:-1], -0.3))
     for threshold, acts in ((0.29, True), (0.3, True), (0.31, False)):
-        policy.config.epsilon = -threshold
+        policy.config.law.epsilon = -threshold
         assert all(d.intervened.all() == acts and d.intervened.any() == acts for d in tiny.drive(policy, 2))
 
 
 def test_risk_is_not_read_as_a_safety_value(risk_filter):
     policy = LatentSafePolicy.from_pretrained(risk_filter)
-    policy.config.law = "reachability"
-    with pytest.raises(CriticTargetError, match=r"law is 'reachability'.*trained for 'risk'.*--policy\.law=risk"):
+    policy.config.law.name = "reachability"
+    wrong = r"law\.name is 'reachability'.*trained for 'risk'.*--policy\.law\.name=risk"
+    with pytest.raises(CriticTargetError, match=wrong):
         tiny.drive(policy)
 
 
 def test_safety_value_is_not_read_as_a_risk(policy):
-    policy.config.law, policy.config.lookahead = "risk", 0
-    with pytest.raises(CriticTargetError, match=r"law is 'risk'.*trained for 'reachability'"):
+    policy.config.law.name, policy.config.law.lookahead = "risk", 0
+    with pytest.raises(CriticTargetError, match=r"law\.name is 'risk'.*trained for 'reachability'"):
         tiny.drive(policy)
 
 
@@ -98,24 +105,22 @@ def test_law_on_the_command_line_is_refused_when_loading(risk_filter):
     from lerobot.configs.policies import PreTrainedConfig
 
     with pytest.raises(draccus.ParsingError) as refused:
-        PreTrainedConfig.from_pretrained(risk_filter, cli_overrides=["--law=reachability"])
+        PreTrainedConfig.from_pretrained(risk_filter, cli_overrides=["--law.name=reachability"])
     assert "trained for 'risk'" in str(refused.value.__cause__)
 
 
 def test_baselines_without_a_critic_go_with_either(risk_filter):
     policy = LatentSafePolicy.from_pretrained(risk_filter)
     for law in ("plan", "margin"):
-        policy.config.law = law
+        policy.config.law.name = law
         tiny.drive(policy, 2)
 
 
 def test_target_edited_by_hand_is_refused(risk_filter, tmp_path):
-    import shutil
-
-    from lerobot_latentsafe.runtime.checkpoint import CheckpointError
-
     copy = shutil.copytree(risk_filter, tmp_path / "copy")
-    tiny.rewrite_json(copy / "config.json", target="reachability", law="reachability")
+    config = json.loads((copy / "config.json").read_text())
+    groups = {"trained_on": {"target": "reachability"}, "law": {"name": "reachability"}}
+    tiny.rewrite_json(copy / "config.json", **{name: config[name] | edit for name, edit in groups.items()})
     with pytest.raises(CheckpointError, match="was edited"):
         LatentSafePolicy.from_pretrained(copy)
 
@@ -127,12 +132,12 @@ def test_unknown_target_lists_the_known_ones(tiny_world_model, cache_meta, tmp_p
 
 def test_risk_has_no_lookahead():
     with pytest.raises(ValueError, match="lookahead is 15; a risk"):
-        tiny.config(law="risk")
+        tiny.config(law_name="risk")
 
 
 def test_the_worst_of_the_samples_counts(policy):
-    start = policy.world_model.initial(2)
-    policy.config.samples, policy.config.lookahead = 6, 0
+    start = policy.model.world_model.initial(2)
+    policy.config.law.samples, policy.config.law.lookahead = 6, 0
     policy.shield.reset()
     latents, least = policy.shield._go_on(start, torch.zeros(2, tiny.ACTION_DIM))
     assert len(least) == 12 and len(latents["h"]) == 12
@@ -140,7 +145,7 @@ def test_the_worst_of_the_samples_counts(policy):
     decision = tiny.drive(policy, 1)[0]
     torch.manual_seed(4)
     values = []
-    original = type(policy).plan
+    original = SafetyModel.plan
 
     def plan(self, latent):
         value, action = original(self, latent)
@@ -148,7 +153,7 @@ def test_the_worst_of_the_samples_counts(policy):
         return value, action
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(type(policy), "plan", plan)
+        patch.setattr(SafetyModel, "plan", plan)
         again = tiny.drive(policy, 1)[0]
     torch.testing.assert_close(again.value, decision.value)
     worst = values[0][:12].view(6, 2).amin(0)
@@ -158,6 +163,5 @@ def test_the_worst_of_the_samples_counts(policy):
 def test_no_samples_is_what_it_was(policy):
     one = tiny.executed(tiny.drive(policy))
     torch.testing.assert_close(one, tiny.executed(tiny.drive(policy)))
-    policy.config.samples = -1
     with pytest.raises(ValueError, match="samples is -1"):
-        policy.config.__post_init__()
+        policy.config.law.changed(LawOptions(samples=-1))

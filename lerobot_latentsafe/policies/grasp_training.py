@@ -78,7 +78,7 @@ def with_aim(
         moved: what of proprioception tells the motion until then.
 
     Raises:
-        FrameCacheError: the cache holds no tokens.
+        EncoderMismatchError: the cache holds pictures, no tokens.
         ValueError: no such command, or it hardly ever falls.
     """
     cache, dataset = FrameCache.open(cache_root), LeRobotDataset(repo_id, root=cache_root)
@@ -89,10 +89,11 @@ def with_aim(
         raise ValueError(f"{switch} hardly ever falls in {repo_id}; record more demonstrations, that grasp something")
     (percepts, state), n_cameras = cache.frames(np.arange(len(move)), ["tokens"]), len(cache.manifest["cameras"])
     tokens, state = percepts["tokens"].to(device), state.to(device)
+    n_patches, token_dim = tokens.shape[1:]
 
     def learned_from(frames: Tensor) -> GraspPredictor:
         torch.manual_seed(0)
-        aim = GraspPredictor(n_cameras, *tokens.shape[1:], state.shape[1], len(moved)).to(device)
+        aim = GraspPredictor(n_cameras, n_patches, token_dim, state.shape[1], len(moved)).to(device)
         aim.fit(tokens[frames], state[frames], move[frames])
         return aim
 
