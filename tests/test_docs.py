@@ -32,6 +32,7 @@ LEROBOT = {
     "lerobot-teleoperate": "lerobot.scripts.lerobot_teleoperate:TeleoperateConfig",
     "lerobot-replay": "lerobot.scripts.lerobot_replay:ReplayConfig",
     "lerobot-rollout": "lerobot.rollout.configs:RolloutConfig",
+    "lerobot-edit-dataset": "lerobot.scripts.lerobot_edit_dataset:EditDatasetConfig",
 }
 """LeRobot's commands and the option class of each."""
 OTHERS = {"cpu", "num_processes", "nproc_per_node", "nnodes", "rdzv_backend", "rdzv_endpoint", "local_addr", "flavor"}
