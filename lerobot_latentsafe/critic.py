@@ -159,6 +159,12 @@ class SafetyCritic(nn.Module):
         target: which of `BACKUPS` the values obey.
     """
 
+    feature_mean: Tensor
+    projection: Tensor
+    candidates: Tensor | None
+    low: Tensor
+    high: Tensor
+
     def __init__(
         self,
         feature_dim: int,

@@ -70,6 +70,13 @@ class Units(nn.Module):
         frozen_commands: commands that a fallback never changes, such as `gripper.pos`.
     """
 
+    action_low: Tensor
+    action_high: Tensor
+    action_varies: Tensor
+    state_mean: Tensor
+    state_std: Tensor
+    frozen: Tensor
+
     def __init__(self, trained_on: TrainedOn, frozen_commands: list[str]):
         super().__init__()
         self.action_names, self.state_names = trained_on.action_names or [], trained_on.state_names or []
@@ -133,7 +140,7 @@ def adopt_dataset(known: TrainedOn, meta: Any, stats: dict) -> TrainedOn:
         ValueError: the dataset is of another robot or rate, its actions never change, or leave the range trained on.
     """
     action, state = meta.features["action"], meta.features["observation.state"]
-    found = {
+    found: dict[str, Any] = {
         "fps": int(meta.fps),
         "action_names": list(action["names"] or []),
         "state_names": list(state["names"] or []),
@@ -150,22 +157,23 @@ def adopt_dataset(known: TrainedOn, meta: Any, stats: dict) -> TrainedOn:
     if known.action_low is None:
         state_std = [max(s, 1e-3) for s in _list(stats["observation.state"]["std"])]
         state_mean = _list(stats["observation.state"]["mean"])
-        adopted = replace(adopted, **_ranges(meta.repo_id, low, high), state_mean=state_mean, state_std=state_std)
+        adopted = replace(_with_ranges(adopted, meta.repo_id, low, high), state_mean=state_mean, state_std=state_std)
     _check_range(adopted, meta.repo_id, low, high)
     return adopted
 
 
-def _ranges(repo_id: str, low: list[float], high: list[float]) -> dict[str, list]:
-    """Ranges of commands; one that never varies gets a band around it, so that float noise is not out of range."""
+def _with_ranges(trained_on: TrainedOn, repo_id: str, low: list[float], high: list[float]) -> TrainedOn:
+    """With ranges of commands; one that never varies gets a band around it, so that float noise is not out of range."""
     varies = [h - l > 1e-6 for l, h in zip(low, high)]
     if not any(varies):
         raise ValueError(f"the actions of {repo_id} never change: {low}; record episodes that move")
     band = [0.0 if v else CONSTANT_BAND * max(abs(l), 1.0) for v, l in zip(varies, low)]
-    return {
-        "action_varies": varies,
-        "action_low": [l - b for l, b in zip(low, band)],
-        "action_high": [h + b for h, b in zip(high, band)],
-    }
+    return replace(
+        trained_on,
+        action_varies=varies,
+        action_low=[l - b for l, b in zip(low, band)],
+        action_high=[h + b for h, b in zip(high, band)],
+    )
 
 
 def _check_range(trained_on: TrainedOn, repo_id: str, low: list[float], high: list[float]) -> None:
