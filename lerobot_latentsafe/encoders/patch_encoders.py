@@ -9,6 +9,7 @@ with whatever was made from its tokens.
 import hashlib
 import logging
 from collections.abc import Callable
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -42,6 +43,8 @@ class PatchEncoder(nn.Module):
     name: str
     dim: int
     patch: int
+    mean: Tensor
+    std: Tensor
 
     def __init__(self) -> None:
         super().__init__()
@@ -83,7 +86,7 @@ def _hash(weights: dict[str, Tensor]) -> str:
 class DinoEncoder(PatchEncoder):
     """DINOv2, with or without registers, or DINOv3, by `transformers`."""
 
-    def __init__(self, name: str, model: nn.Module):
+    def __init__(self, name: str, model: Any):
         super().__init__()
         self.name, self.model = name, model
         self.dim, self.patch = model.config.hidden_size, model.config.patch_size
@@ -97,6 +100,9 @@ class DinoEncoder(PatchEncoder):
 
 class _Conv(nn.Module):
     """Convolution with its batch norm folded in, padded as TensorFlow pads, and ReLU6 if `act`."""
+
+    weight: Tensor
+    bias: Tensor
 
     def __init__(self, weights: dict[str, Tensor], conv: str, norm: str, stride: int = 1, act: bool = True):
         super().__init__()

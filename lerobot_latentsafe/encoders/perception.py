@@ -62,6 +62,10 @@ class PerceptionConfig:
 class FrameBasis(nn.Module):
     """Principal components of the flattened tokens of a frame, on one scale: (..., P, C) -> (..., K)."""
 
+    mean: Tensor
+    axes: Tensor
+    fitted: Tensor
+
     def __init__(self, n_inputs: int, n_components: int):
         super().__init__()
         self.register_buffer("mean", torch.zeros(n_inputs))

@@ -78,6 +78,10 @@ class WorldModel(nn.Module, abc.ABC):
         """Whether it shows a latent's features as pictures, by `decode`."""
         return False
 
+    def decode(self, features: Tensor) -> dict[str, Tensor]:
+        """Features (N, D) as pictures, of a model that `draws`: camera key -> (N, 3, S, S), about in [0, 1]."""
+        raise NotImplementedError(f"a {self.config.type} world model draws no pictures")
+
     @property
     def percept_names(self) -> list[str]:
         """Keys of what `perceive` returns."""
@@ -104,6 +108,10 @@ class WorldModel(nn.Module, abc.ABC):
     @abc.abstractmethod
     def features(self, latent: Latent) -> Tensor:
         """(..., D), what margin, actor and critic read."""
+
+    def latent_of(self, features: Tensor, action: Tensor) -> Latent:
+        """The latent with these features (N, D), led to by actions (N, A), of a model whose features tell all of it."""
+        raise NotImplementedError(f"the features of a {self.config.type} world model do not tell its latent")
 
     @abc.abstractmethod
     def ended(self, latent: Latent) -> Tensor:

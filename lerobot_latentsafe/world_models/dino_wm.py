@@ -119,6 +119,8 @@ class DinoWM(TerminationHead):
         perception: what makes tokens of images; without it the model reads tokens only.
     """
 
+    config: DinoWMConfig
+
     def __init__(
         self, config: DinoWMConfig, image_keys: list[str], state_dim: int, action_dim: int, n_patches: int,
         token_dim: int, perception: Perception | None = None,
@@ -184,7 +186,7 @@ class DinoWM(TerminationHead):
         """Next latent under actions (B, A), from the frame and the H - 1 before it."""
         past = [latent[name] for name in self.past_names]
         now = (latent["tokens"], latent["state"], action, latent["seen"])
-        return self._next_latent(self._advance(*(t[:, None] for t in now), past), 0, latent["seen"], action)
+        return self._next_latent(self._advance(*(t[:, None] for t in now), past=past), 0, latent["seen"], action)
 
     def correct(self, predicted: Latent, percepts: dict[str, Tensor], state: Tensor) -> Latent:
         """The tokens and state that were seen in place of those predicted."""
@@ -204,7 +206,7 @@ class DinoWM(TerminationHead):
         return torch.zeros_like(percepts["tokens"]) if self.config.blind else percepts["tokens"]
 
     def _advance(
-        self, tokens: Tensor, state: Tensor, action: Tensor, seen: Tensor, past: list[Tensor] | None = None
+        self, tokens: Tensor, state: Tensor, action: Tensor, seen: Tensor, *, past: list[Tensor] | None = None
     ) -> _Ahead:
         """One step ahead of each of T frames, under the actions taken there.
 

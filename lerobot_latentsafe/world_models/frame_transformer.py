@@ -23,6 +23,8 @@ class FrameTransformer(nn.Module):
         condition_dim: width of a condition that scales, shifts and gates every layer (AdaLN); None for none.
     """
 
+    angle: Tensor
+
     def __init__(
         self, dim: int, depth: int, heads: int, head_dim: int, mlp: int, history: int, condition_dim: int | None = None
     ):

@@ -58,6 +58,8 @@ class GRUConfig(WorldModelConfig):
 class FrameGRU(WorldModel):
     """See the module's text. Latent: hidden (B, H), vector (B, C), state (B, S), action (B, A)."""
 
+    config: GRUConfig
+
     def __init__(self, config: GRUConfig, image_keys: list[str], state_dim: int, action_dim: int):
         super().__init__()
         if not image_keys:
@@ -76,12 +78,12 @@ class FrameGRU(WorldModel):
         self.frame_in = nn.Sequential(nn.Linear(n_vector + state_dim, units), nn.SiLU())
         self.action_in = nn.Sequential(nn.Linear(action_dim, units // 4), nn.SiLU())
         self.cell = nn.GRUCell(units + units // 4, config.hidden)
-        self.change = nn.Sequential(
-            nn.Linear(config.hidden + n_vector + state_dim, units), nn.SiLU(), nn.Linear(units, n_vector + state_dim)
-        )
+        first = nn.Linear(config.hidden + n_vector + state_dim, units)
+        last = nn.Linear(units, n_vector + state_dim)
+        self.change = nn.Sequential(first, nn.SiLU(), last)
         with torch.no_grad():  # start from the best guess without learning: nothing changes
-            self.change[-1].weight.mul_(0.1)
-            self.change[-1].bias.zero_()
+            last.weight.mul_(0.1)
+            last.bias.zero_()
 
     @property
     def percept_names(self) -> list[str]:
@@ -99,7 +101,7 @@ class FrameGRU(WorldModel):
 
     def initial(self, batch_size: int) -> Latent:
         """Zeros: (B, ...)."""
-        weight = self.change[-1].weight
+        weight = self.cell.weight_hh
         return {name: weight.new_zeros(batch_size, size) for name, size in self.sizes.items()}
 
     def step(self, latent: Latent, action: Tensor) -> Latent:
@@ -132,7 +134,8 @@ class FrameGRU(WorldModel):
     def error(self, latent: Latent, percepts: dict[str, Tensor], state: Tensor) -> Tensor:
         """Squared distance of frame and state from what was seen, summed: (B,)."""
         seen = self.correct(latent, percepts, state)
-        return sum((latent[name] - seen[name]).square().sum(-1) for name in ("vector", "state"))
+        vector, state = ((latent[name] - seen[name]).square().sum(-1) for name in ("vector", "state"))
+        return vector + state
 
     def loss(self, clip: Clip) -> tuple[Tensor, Tensor, dict[str, float]]:
         """Squared errors of all predicted frames, in units of what changes from one frame to the next."""

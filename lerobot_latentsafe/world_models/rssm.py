@@ -148,6 +148,9 @@ class _ImageDecoder(nn.Module):
 class RSSM(TerminationHead):
     """See the module's text. Latent: h (B, H) and x (B, X), flat one-hot vectors where it is categorical."""
 
+    config: RSSMConfig
+    mean_count: Tensor
+
     def __init__(self, config: RSSMConfig, image_keys: list[str], state_dim: int, action_dim: int):
         super().__init__()
         if not image_keys:
@@ -240,7 +243,8 @@ class RSSM(TerminationHead):
             seen = self.features(self.correct(latent, percepts, state))
             return (self.features(latent) - seen).square().mean(-1)
         decoded = self.decode(self.features(latent))
-        return sum((decoded[key] - percepts[key]).square().mean((1, 2, 3)) for key in self.image_keys)
+        errors = [(decoded[key] - percepts[key]).square().mean((1, 2, 3)) for key in self.image_keys]
+        return torch.stack(errors).sum(0)
 
     def embed(self, images: dict[str, Tensor], state: Tensor) -> Tensor:
         """Observations (N, ...) -> (N, hidden)."""

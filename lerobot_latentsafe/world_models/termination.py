@@ -14,6 +14,7 @@ class TerminationHead(WorldModel):
     """A world model with a head `continues`, features (..., D) -> (..., 1): the logit of the episode going on."""
 
     continues: nn.Module
+    ends_seen: Tensor
 
     def __init__(self) -> None:
         super().__init__()
