@@ -48,10 +48,10 @@ class BasePolicy:
             raise CheckpointError(
                 f"base policy {folder}: weights unreadable or not its own ({e}); copy it again"
             ) from e
-        pipelines = make_pre_post_processors(
+        preprocessor, postprocessor = make_pre_post_processors(
             config, pretrained_path=folder, preprocessor_overrides={"device_processor": {"device": device}}
         )
-        return cls(policy, *pipelines, ahead)
+        return cls(policy, preprocessor, postprocessor, ahead)
 
     @property
     def config(self) -> PreTrainedConfig:

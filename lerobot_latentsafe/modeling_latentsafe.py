@@ -65,7 +65,7 @@ class LatentSafePolicy(PreTrainedPolicy):
             data = adopt(config, dataset_meta, dataset_stats or dataset_meta.stats)
         self.model = model or SafetyModel(config)
         config.validate_features()
-        self.reader = data and data.reader(config.world_model.clip_length, self.model.units)
+        self.reader = None if data is None else data.reader(config.world_model.clip_length, self.model.units)
         if data is not None and data.cache is not None:
             self.model.world_model.load_basis(Path(data.frame_cache))
         setattr(self, NOT_AVERAGED, self._never_averaged())

@@ -41,7 +41,10 @@ class Eyes(Protocol):
     """What turns pictures into percepts: a world model, as far as reading clips is concerned."""
 
     image_keys: list[str]
-    percept_names: list[str]
+
+    @property
+    def percept_names(self) -> list[str]:
+        """Keys of what `perceive` returns."""
 
     def perceive(self, images: dict[str, Tensor]) -> dict[str, Tensor]:
         """Camera key -> (B, C, H, W) in [0, 1] to name -> (B, ...)."""
@@ -50,7 +53,9 @@ class Eyes(Protocol):
 class Seeing(Protocol):
     """What reads the pictures of a batch: a safety model."""
 
-    world_model: Eyes
+    @property
+    def world_model(self) -> Eyes:
+        """What makes percepts of them."""
 
     def images(self, images: Tensor) -> Tensor:
         """Pictures (..., 3, H, W) as the world model takes them."""

@@ -36,6 +36,13 @@ class GraspPredictor(nn.Module):
         n_moves: M, numbers that tell a motion.
     """
 
+    token_mean: Tensor
+    token_std: Tensor
+    state_mean: Tensor
+    state_std: Tensor
+    move_mean: Tensor
+    move_std: Tensor
+
     def __init__(self, n_cameras: int, n_patches: int, token_dim: int, state_dim: int, n_moves: int):
         super().__init__()
         side = round(n_patches**0.5)

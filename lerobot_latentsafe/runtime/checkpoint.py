@@ -5,6 +5,7 @@ import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import draccus
 from huggingface_hub import snapshot_download
@@ -30,7 +31,7 @@ def committed_names() -> list[str]:
     return sorted(p.parent.name for p in PRETRAINED.glob(f"*/{CONFIG}"))
 
 
-def resolve_checkpoint(path: str | Path, revision: str | None = None, **hub: object) -> Path:
+def resolve_checkpoint(path: str | Path, revision: str | None = None, **hub: Any) -> Path:
     """A local folder for a folder, the name of a committed checkpoint, or a Hub id.
 
     Raises:

@@ -98,6 +98,8 @@ def two_hot(x: Tensor, bins: Tensor) -> Tensor:
 class TwoHotHead(nn.Module):
     """A number as a distribution over bins in symlog space: features (..., D) -> its mean (...,)."""
 
+    bins: Tensor
+
     def __init__(self, feature_dim: int, config: BehaviorConfig):
         super().__init__()
         last = nn.Linear(config.hidden, config.bins)
@@ -121,6 +123,8 @@ class Actor(nn.Module):
     Args:
         varies: bool (A,), the commands it moves; the others stay at 0.
     """
+
+    varies: Tensor
 
     def __init__(self, feature_dim: int, varies: Tensor, config: BehaviorConfig):
         super().__init__()
@@ -185,6 +189,8 @@ def lambda_returns(reward: Tensor, value: Tensor, gamma: float, trace: float) ->
 
 class ReturnRange(nn.Module):
     """Tracks the range from the 5th to the 95th percentile of returns; advantages are divided by it if it exceeds 1."""
+
+    range: Tensor
 
     def __init__(self, rate: float):
         super().__init__()

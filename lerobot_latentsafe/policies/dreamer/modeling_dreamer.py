@@ -112,7 +112,7 @@ class LatentSafeDreamerPolicy(PreTrainedPolicy):
             "a latentsafe_dreamer policy learns from episodes of its own: train it with latentsafe train-dreamer"
         )
 
-    def model_loss(self, clip: Clip, reward: Tensor) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+    def model_loss(self, clip: Clip, reward: Tensor) -> tuple[Tensor, Tensor, dict[str, Tensor | float]]:
         """Loss of world model, margin and reward head, the clip's features (B, T, D), and metrics.
 
         Args:
@@ -152,7 +152,7 @@ class LatentSafeDreamerPolicy(PreTrainedPolicy):
     @torch.no_grad()
     def follow_slowly(self) -> None:
         """Move the slow critic towards the critic."""
-        slow, fast = list(self.slow_critic.parameters()), list(self.critic.parameters())
+        slow, fast = tuple(self.slow_critic.parameters()), tuple(self.critic.parameters())
         torch._foreach_lerp_(slow, fast, self.config.behavior.slow_rate)
 
     # -- files ---
