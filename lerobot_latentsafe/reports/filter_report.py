@@ -176,7 +176,7 @@ def _recording(
             f"{recording.frames.meta.repo_id}: {(steps > 0).sum()} episodes; the filter acted in "
             f"{(acted > 0).sum()} of them, and in {acted.sum() / steps.sum():.1%} of all steps."
         ),
-        html.table(["why a step was judged as it was", "steps"], list(count_reasons(decisions["reason"]).items())),
+        html.table(["why a step was judged as it was", "steps"], count_reasons(decisions["reason"]).items()),
         html.paragraph("The episodes in which it acted most; an orange frame while it acts. " + CURVES),
     ]
     most = [i for i in np.argsort(-acted, kind="stable").tolist() if steps[i]][:SHOWN]

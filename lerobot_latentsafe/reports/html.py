@@ -2,6 +2,7 @@
 
 import base64
 import html
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -61,8 +62,8 @@ def heading(text: str) -> str:
     return f"<h2>{html.escape(text)}</h2>"
 
 
-def table(header: list[str], rows: list[list[str]]) -> str:
-    """A table of plain strings."""
+def table(header: Sequence[str], rows: Iterable[Iterable[object]]) -> str:
+    """A table of plain text."""
     cells = lambda row, tag: "".join(f"<{tag}>{html.escape(str(c))}</{tag}>" for c in row)  # noqa: E731
     body = "".join(f"<tr>{cells(row, 'td')}</tr>" for row in rows)
     return f"<table><tr>{cells(header, 'th')}</tr>{body}</table>"

@@ -4,7 +4,7 @@ Poses are of the tool centre between the fingertips, in the robot's base frame; 
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -67,7 +67,9 @@ class FrankyDriver:
 
     def __init__(self, config: LatentSafeFrankaConfig):
         self.config = config
-        self.robot = self.gripper = self.tracker = None
+        self.robot: Any = None  # these three are of franky, which need not be installed
+        self.gripper: Any = None
+        self.tracker: Any = None
         self._width, self._moving = GRIPPER_WIDTH, None
 
     def connect(self) -> None:
@@ -175,7 +177,6 @@ class _ArmErrors:
     def __enter__(self) -> None:
         pass
 
-    def __exit__(self, kind, error, traceback) -> bool:
+    def __exit__(self, kind, error, traceback) -> None:
         if isinstance(error, Exception) and not isinstance(error, FrankaError):
             raise FrankaError(str(error)) from error
-        return False

@@ -4,6 +4,7 @@ import logging
 import threading
 import time
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from lerobot.robots.robot import Robot
@@ -96,7 +97,7 @@ class LatentSafeFranka(FrankaDevice, Robot):
         state = self._recovered_state()
         turned = (state.rotation * DOWN.inv()).as_rotvec()
         values = [*state.joints, np.clip(state.width / GRIPPER_WIDTH, 0, 1), *state.position, *turned]
-        observation = dict(zip(STATE_NAMES, map(float, values)))
+        observation: dict[str, Any] = dict(zip(STATE_NAMES, map(float, values)))
         for name, camera in self.cameras.items():
             observation[name] = camera.async_read()
             expected = self.observation_features[name]
