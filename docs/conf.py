@@ -23,7 +23,6 @@ default_role = "literal"
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented_params"
 autodoc_class_signature = "mixed"
-autodoc_mock_imports = ["jax", "hj_reachability", "franky"]
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
