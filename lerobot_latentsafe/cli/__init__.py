@@ -6,6 +6,7 @@ Importing this loads neither LeRobot nor a model; `main` imports the verb that i
 import difflib
 import importlib
 import logging
+import os
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -108,6 +109,7 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
 
 def main(argv: list[str] | None = None) -> None:
     """Entry point of the console command `latentsafe`."""
+    os.environ.setdefault("MPLBACKEND", "Agg")  # pictures are written, never shown
     verb, *options = (sys.argv[1:] if argv is None else argv) or ["--help"]
     if verb in ("-h", "--help", "help"):
         if not options:

@@ -9,7 +9,7 @@ from lerobot.robots.config import RobotConfig
 @RobotConfig.register_subclass("latentsafe_franka")
 @dataclass(kw_only=True)
 class LatentSafeFrankaConfig(RobotConfig):
-    """A Franka Research 3 with the Franka Hand, by franky-control. See docs/franka_commissioning.md before using it.
+    """A Franka Research 3 with the Franka Hand, by franky-control. See docs/franka.md before using it.
 
     Attributes:
         ip: of the robot's control interface (FCI).
