@@ -106,6 +106,7 @@ SHIELDED = ["teleoperate", "--robot.type=latentsafe_shielded"]
             "did you mean --env.episode_length?",
         ),
         (["eval-shield", "--env.type=latentsafe_dubin"], "did you mean latentsafe_dubins?"),
+        (["eval-shield", "--env=latentsafe_dubins"], "did you mean --env.type?"),
         (["cache", "--repo_id=me/car", "--output_dir=x"], "did you mean --dataset.repo_id?"),
         (["wrap", "--policy.pth=dubins", "--output_dir=x"], "did you mean --policy.path?"),
         (
@@ -124,7 +125,8 @@ def test_the_nearest_verb_or_option_is_suggested_in_one_line(capsys, argv, meant
     [
         (["path", "bag"], "unexpected 'bag'; options are given as --name=value"),
         (["path", "--name"], "--name has no value"),
-        (["path", "--zzzz=1"], "unknown option --zzzz"),
+        (["path", "--zzzz=1"], "unknown option --zzzz; latentsafe path --help lists all"),
+        (["wrap", "--law.retreat={a"], "--law.retreat is '{a', which is not YAML"),
         (["wrap", "--law.epsilon=0.1"], "give --policy.path, --output_dir"),
         (["wrap", "--policy.path=x", "--output_dir=y", "--law.epsilon=much"], "--law.epsilon: Couldn't parse 'much'"),
         (["wrap", "--policy.path=x", "--output_dir=y", "--half=maybe"], "--half: Couldn't parse"),
@@ -308,6 +310,7 @@ def test_eval_shield_writes_the_documented_keys(tiny_filter, tiny_diffusion, tmp
     )  # fmt: skip
     row = json.loads((tmp_path / "row.json").read_text())
     assert set(row) >= PROVENANCE and row["seeds"] == [4] and row["epsilon"] == 0.1
+    assert (row["guard"], row["release"], row["law"]) == (1, -1.0, "reachability")
     for name in ("bare", "shielded"):
         assert set(row[name]) == {"success", "violation", "incompletion", "overridden_share", "mean_action_change"}
         for outcome in ("success", "violation", "incompletion"):

@@ -343,6 +343,8 @@ def test_a_recording_stores_what_was_executed(tmp_path, epsilon, capsys):
     assert f"{100.0 * (epsilon == ALWAYS):.1f}% of all steps" in page.read_text()
     assert page.read_text().count("<video") == dataset.num_episodes
     assert ("imagined failure" in page.read_text()) == (epsilon == ALWAYS)
+    cli.main(["report", f"--policy.path={trained}", *shown, "--dataset.episodes=[1]"])
+    assert page.read_text().count("<video") == 1 and "me/shielded: 1 episodes" in page.read_text()
 
 
 def test_lerobots_own_commands_take_the_shielded_robot(trained, tmp_path, monkeypatch):

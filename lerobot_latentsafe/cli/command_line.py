@@ -14,6 +14,7 @@ from types import NoneType, UnionType
 from typing import Any
 
 import draccus
+import yaml
 from draccus import ChoiceType
 from draccus.wrappers.docstring import get_attribute_docstring
 from lerobot.utils.import_utils import register_third_party_plugins
@@ -197,7 +198,7 @@ def pairs(argv: list[str]) -> list[tuple[str, str]]:
     """Names and values of `--name=value` or `--name value`.
 
     Raises:
-        UsageError: something that is neither.
+        UsageError: something that is neither, or a value that is not YAML.
     """
     found, rest = [], list(argv)
     while rest:
@@ -208,8 +209,19 @@ def pairs(argv: list[str]) -> list[tuple[str, str]]:
             if not rest or rest[0].startswith("--"):
                 raise UsageError(f"{name} has no value; give {name}=...")
             value = rest.pop(0)
+        _require_yaml(name, value)
         found.append((name.removeprefix("--"), value))
     return found
+
+
+def _require_yaml(name: str, value: str) -> None:
+    """Refuse what draccus cannot read as a value."""
+    try:
+        draccus.cfgparsing.parse_string(value)
+    except yaml.YAMLError as e:
+        raise UsageError(
+            f"{name} is {value!r}, which is not YAML; write lists as '[a, b]', others as '{{a: 1}}'"
+        ) from e
 
 
 def renamed(verb: str, options: type, given: list[tuple[str, str]]) -> list[tuple[str, str]]:
@@ -239,10 +251,11 @@ def _require_known(verb: str, name: str, value: str, known: list[Option]) -> Non
     if _is_known(name, value, by_name):
         return
     old, last = RENAMED.get(verb, {}), {option.rpartition(".")[2]: option for option in reversed(by_name)}
-    meant = nearest(name, [*by_name, *old, *last])
+    grouped = next((option for option in by_name if option.startswith(f"{name}.")), None)
+    meant = grouped or nearest(name, [*by_name, *old, *last])
     meant = meant if meant in by_name else old.get(meant, last.get(meant))
-    hint = f"did you mean --{meant}?" if meant else "these are its options:"
-    raise UsageError(f"unknown option --{name}; {hint} latentsafe {verb} --help lists all")
+    hint = f"did you mean --{meant}? " if meant else ""
+    raise UsageError(f"unknown option --{name}; {hint}latentsafe {verb} --help lists all")
 
 
 def _require_choice(option: Option, value: str) -> None:
