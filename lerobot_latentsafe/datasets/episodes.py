@@ -39,7 +39,7 @@ class DatasetFrames:
         self._check_files()
 
     def _check_files(self) -> None:
-        files = {}
+        files: dict[Path, int] = {}
         for episode in self.episodes:
             files.setdefault(self.root / self.meta.get_data_file_path(episode), episode)
             for camera in set(self.cameras) & set(self.meta.video_keys):

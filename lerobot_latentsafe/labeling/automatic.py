@@ -192,7 +192,8 @@ def label_automatically(
         labelled: episodes; undecided: episodes; refused: (episode, why) of answers that were no labels.
     """
     open_episodes = [e for e in frames.episodes if (store.labels(specification, e) == UNLABELLED).all()]
-    found, result = {}, {"labelled": [], "undecided": [], "refused": []}
+    found = {}
+    result: dict[str, list] = {"labelled": [], "undecided": [], "refused": []}
     for number in tqdm(open_episodes, desc=name, unit="episode"):
         length = int(store.length[number])
         episode = Episode(number, length, ", ".join(frames.meta.episodes[number]["tasks"]), frames)

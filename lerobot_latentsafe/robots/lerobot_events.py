@@ -8,7 +8,7 @@ from lerobot_latentsafe._compat import RECORDING, RESETTING, RETURNING
 class LeRobotEvents(logging.Handler):
     """Hears in LeRobot's log when an episode begins or ends, between `listen` and `stop`."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__(logging.INFO)
         self._heard: int | str | None = None
 

@@ -6,6 +6,7 @@ Within models actions are in [-1, 1] and images in [0, 1]; `action[t]` is the ac
 """
 
 import abc
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -122,7 +123,7 @@ class WorldModel(nn.Module, abc.ABC):
         """How far a latent is from what was then seen: squared error (B,), in a unit of the model's own."""
 
     @abc.abstractmethod
-    def loss(self, clip: Clip) -> tuple[Tensor, Tensor, dict[str, Tensor | float]]:
+    def loss(self, clip: Clip) -> tuple[Tensor, Tensor, Mapping[str, Tensor | float]]:
         """Training loss, features (B, T, D) of the posterior for the co-trained margin, and metrics."""
 
     def observe(

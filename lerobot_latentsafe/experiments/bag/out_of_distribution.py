@@ -29,7 +29,8 @@ UNSEEN = [name for name in VARIANTS if name not in (SEEN, "sealed")]
 @lru_cache(maxsize=128)
 def recording(seed: int) -> tuple[np.ndarray, ...]:
     """The actions of an unfiltered operator on the bag that the filter knows."""
-    red, actions = bag_scene(SEEN), []
+    red = bag_scene(SEEN)
+    actions: list[np.ndarray] = []
     red.reset(seed)
     drive(red, None, _noted(begin("closed_end", red, None, np.random.default_rng([0, seed])), actions))
     return tuple(actions)

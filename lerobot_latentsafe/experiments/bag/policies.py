@@ -38,7 +38,7 @@ def film(name: str, bare: dict, shielded: dict, folder: Path) -> Path:
 
 def draw(table: dict[str, dict], law: str, path: Path) -> None:
     """How many runs spill at least p%, bare and under the filters of a law together."""
-    lost = {}
+    lost: dict[str, list[int]] = {}
     for who, cells in table.items():
         lost |= {who: cells["bare"]["lost"], f"{who}, shielded": cells[law]["pooled"]["lost"]}
     save(severity(lost, bag_scene().n_candies), path)

@@ -49,6 +49,9 @@ class LatentSafeShielded(Robot):
     config_class = LatentSafeShieldedConfig
     name = "latentsafe_shielded"
 
+    _phase: int | str | None
+    _decided_at: float | None
+
     def __init__(self, config: LatentSafeShieldedConfig):
         super().__init__(config)
         self.config = config
@@ -297,9 +300,9 @@ class LatentSafeShielded(Robot):
         """Start an episode: nothing seen, nothing decided."""
         self.filter.shield.reset()
         self._observation, self._fresh, self._seen_at = None, False, 0.0
-        self._phase: int | str | None = None
+        self._phase = None
         self._sent_early = None
-        self._decided_at: float | None = None
+        self._decided_at = None
         self._gaps: deque[float] = deque(maxlen=RATE_DECISIONS)
         self._cameras: dict[str, dict] = {}
         self._said: set[str] = set()
