@@ -170,7 +170,7 @@ def test_sealed_bag_does_not_spill():
 def test_margin_is_negative_exactly_in_failures(bag_scene):
     for truth in play(bag_scene, "closed_end"):
         assert (truth["margin"] < 0) == truth["failure"] == (truth["spilled"] > 0)
-        assert truth["spill_fraction"] == truth["spilled"] / bag_scene.n_candies
+        assert truth["severity"] == truth["spilled"] / bag_scene.n_candies
 
 
 def test_the_bag_lies_anywhere_at_any_yaw(bag_scene):

@@ -9,7 +9,7 @@ from lerobot_latentsafe import LatentSafeDubinsEnv
 from lerobot_latentsafe.decision import LawOptions, Reason
 from lerobot_latentsafe.dubins.car import step as car_step
 from lerobot_latentsafe.envs import dubins_env
-from lerobot_latentsafe.evaluation.rollouts import Episodes, check_environment, compare, run_episodes
+from lerobot_latentsafe.evaluation.rollouts import Choice, Episodes, check_environment, compare, run_episodes, steps
 from lerobot_latentsafe.experiments.dubins.figures import trajectories
 from lerobot_latentsafe.modeling_latentsafe import load_filter
 
@@ -28,6 +28,33 @@ def shielded(tiny_filter, tiny_diffusion):
 @pytest.fixture(scope="module")
 def result(shielded):
     return compare(shielded, car(), N, seed=0, n_videos=2)
+
+
+class Countdown:
+    """Two numbers that count down to 0 by what is taken off; `info` is their values."""
+
+    def __init__(self, *numbers):
+        self.info = np.array(numbers)
+
+    @property
+    def over(self):
+        return self.info <= 0
+
+    def observe(self):
+        return {"left": self.info}
+
+    def step(self, action):
+        self.info = self.info - action
+
+
+def test_the_loop_goes_on_until_all_episodes_have_ended():
+    seen, taken = [], np.array([1, 2])
+    made = list(steps(Countdown(1, 5), lambda batch: seen.append(batch["left"].tolist()) or Choice(taken)))
+    assert seen == [[1, 5], [0, 3], [-1, 1]]
+    assert [step.alive.tolist() for step in made] == [[True, True], [False, True], [False, True]]
+    assert [(step.before.tolist(), step.info.tolist()) for step in made[:2]] == [([1, 5], [0, 3]), ([0, 3], [-1, 1])]
+    assert all(step.action is taken and step.decision is None for step in made)
+    assert not list(steps(Countdown(0, 0), lambda batch: pytest.fail("nothing is left to do")))
 
 
 def test_bare_and_shielded_start_from_the_same_states(result):

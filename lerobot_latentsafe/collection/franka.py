@@ -24,6 +24,7 @@ from lerobot_latentsafe.collection.policy_operator import PolicyOperator
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE
 from lerobot_latentsafe.evaluation.rollouts import Choice, steps
 from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES, action_limits, read_action
+from lerobot_latentsafe.franka.bag import BagScene
 from lerobot_latentsafe.franka.behaviors import GRASPED, grasp, stray
 from lerobot_latentsafe.franka.scenes import CLUMSINESS, HELD_ANYWHERE, SCENES
 from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
@@ -198,15 +199,7 @@ def _record_part(source: Source, repo_id: str, parts: Path, episodes: range, see
 def episode_frames(robot: LatentSafeFrankaMujoco, source: Source, episode: int, seed: int) -> Iterator[dict]:
     """The frames of an episode as `LeRobotDataset.add_frame` takes them; the first failing frame and all after fail."""
     info, scene = SCENES[source.scene], robot.scene
-    start = episode // source.branches if source.branches else episode
-    robot.reset(_scene_seed(seed, start))
-    n_frames = round((source.seconds or info.episode_seconds) * info.fps)
-    if source.branches:
-        n_frames -= _grasp(robot, _scene_seed(seed, start), source)
-    rng = np.random.default_rng([8, _scene_seed(seed, start)])
-    if rng.random() < source.astray:
-        _go(robot, stray(scene, GRASPED[source.behavior(episode)], rng))
-    pushes = _pushes(source.pushed / info.fps, n_frames, rng)
+    pushes = _begin(robot, source, episode, _scene_seed(seed, source, episode))
     failed = False
     with _operator(robot, source, episode) as operator:
         actor = lambda seen: Choice(read_action(operator(seen), info.fps).delta)  # noqa: E731
@@ -224,6 +217,20 @@ def episode_frames(robot: LatentSafeFrankaMujoco, source: Source, episode: int, 
                 "next.done": np.array([False]),
                 "task": scene.task,
             }
+
+
+def _begin(robot: LatentSafeFrankaMujoco, source: Source, episode: int, scene_seed: int) -> np.ndarray:
+    """Bring the robot where the episode starts. Returns the pushes (T, 7) of the T steps that it has."""
+    robot.reset(scene_seed)
+    info, scene = SCENES[source.scene], robot.scene
+    n_frames = round((source.seconds or info.episode_seconds) * info.fps)
+    if source.branches:
+        n_frames -= _grasp(robot, scene_seed, source)
+    rng = np.random.default_rng([8, scene_seed])
+    if rng.random() < source.astray:
+        bag: BagScene = scene
+        _go(robot, stray(bag, GRASPED[source.behavior(episode)], rng))
+    return _pushes(source.pushed / info.fps, n_frames, rng)
 
 
 @contextmanager
@@ -292,15 +299,17 @@ class PushedRobot:
         self.info, self.t = scene.truth(), self.t + 1
 
 
-def _scene_seed(seed: int, start: int) -> int:
-    return 1_000_000 * seed + start
+def _scene_seed(seed: int, source: Source, episode: int) -> int:
+    """Branches share their start."""
+    return 1_000_000 * seed + (episode // source.branches if source.branches else episode)
 
 
 def _grasp(robot: LatentSafeFrankaMujoco, seed: int, source: Source) -> int:
     """Close the fingers on the bag, unrecorded. Returns the steps taken."""
     rng = np.random.default_rng([7, seed])
     segment = rng.choice(len(source.grasps), p=source.grasps)
-    return _go(robot, grasp(robot.scene, int(segment), rng, clumsiness=source.clumsiness))
+    bag: BagScene = robot.scene
+    return _go(robot, grasp(bag, int(segment), rng, clumsiness=source.clumsiness))
 
 
 def _go(robot: LatentSafeFrankaMujoco, actions: Iterator[np.ndarray]) -> int:

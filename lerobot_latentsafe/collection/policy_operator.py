@@ -57,9 +57,9 @@ class PolicyOperator:
             proposed, unsafe = self.policy.propose(batch), None
         else:
             decision = self.filter.decide(batch)
-            proposed, unsafe = decision.proposed, decision.unsafe.item()
-        proposed = np.clip(proposed[0].double().numpy(), *self.limits)
-        action, intervened = self.interventions(proposed, unsafe)
+            proposed, unsafe = decision.proposed, bool(decision.unsafe)
+        wanted = np.clip(proposed[0].double().numpy(), *self.limits)
+        action, intervened = self.interventions(wanted, unsafe)
         executed = torch.from_numpy(action).float()[None]
         if intervened:
             self.policy.replan(executed)

@@ -35,7 +35,7 @@ ACTION_NAMES = ["turn_rate.vel", "speed.vel"]
 policies then fail to train, so the constant is recorded too."""
 
 
-def step(states: np.ndarray, turn_rates: np.ndarray) -> np.ndarray:
+def step(states: np.ndarray, turn_rates: np.ndarray | float) -> np.ndarray:
     """One Euler step. states: (..., 3), turn_rates: (...,) in rad/s -> (..., 3); headings are not wrapped."""
     x, y, heading = np.moveaxis(states, -1, 0)
     return np.stack([x + DT * SPEED * np.cos(heading), y + DT * SPEED * np.sin(heading), heading + DT * turn_rates], -1)

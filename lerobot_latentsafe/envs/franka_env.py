@@ -75,13 +75,17 @@ class FrankaEnv(gym.Env):
 
     def _info(self) -> dict:
         truth = self.scene.truth()
-        self.failed |= truth["failure"]
+        self.failed |= bool(truth["failure"])
         return {**truth, "failure": self.failed, "is_success": truth["is_success"] and not self.failed}
 
 
 class BagEnv(FrankaEnv):
+    """Lift an open bag without spilling candy."""
+
     scene_name = "bag"
 
 
 class BlocksEnv(FrankaEnv):
+    """Pluck a block from between two others."""
+
     scene_name = "blocks"

@@ -40,11 +40,13 @@ class World(Protocol):
 
     Attributes:
         info: what is known of where they are now, beyond what an actor sees; of what kind, each world says.
-        over: bool (B,), which of them have ended.
     """
 
     info: Any
-    over: np.ndarray
+
+    @property
+    def over(self) -> np.ndarray:
+        """Which of them have ended: bool (B,)."""
 
     def observe(self) -> Any:
         """What an actor sees now: of most worlds a LeRobot batch."""
@@ -92,6 +94,11 @@ class PolicyActor:
     def __init__(self, policy: BasePolicy | LatentSafePolicy):
         policy.reset()
         self.policy = policy
+
+    @property
+    def latent(self) -> Latent | None:
+        """What a filter's last decision was made on."""
+        return self.policy.shield.latent if isinstance(self.policy, LatentSafePolicy) else None
 
     @torch.no_grad()
     def __call__(self, batch: dict[str, Any]) -> Choice:
@@ -150,7 +157,7 @@ class Episodes:
         steps: int (n,) steps driven.
         overridden: int (n,) steps at which the fallback acted.
         action_change: (n,) summed distance between executed and proposed action, robot units.
-        severity: (n,) the largest share spilled at any step; not a number where there is nothing to spill.
+        severity: (n,) of the failure at its worst, 0 to 1; not a number where the environment tells none.
         traces: one dict of lists an episode: action, proposed, value, margin, intervened, reason, state.
         frames: RGB frames of the episodes asked for.
         latents: the filter's latents (1, ...) at each step of those.
@@ -186,9 +193,10 @@ class Episodes:
     def joined(cls, parts: "list[Episodes]") -> "Episodes":
         """All of these, one after the other."""
         arrays = ("success", "violation", "steps", "overridden", "action_change", "severity")
-        joined = {name: np.concatenate([getattr(p, name) for p in parts]) for name in arrays}
-        lists = {name: [x for p in parts for x in getattr(p, name)] for name in ("traces", "frames", "latents")}
-        return cls(**joined, **lists)
+        joined: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in parts]) for name in arrays}
+        for name in ("traces", "frames", "latents"):
+            joined[name] = [x for p in parts for x in getattr(p, name)]
+        return cls(**joined)
 
 
 def check_environment(policy: LatentSafePolicy, env: EnvConfig) -> None:
@@ -234,8 +242,8 @@ def run_episodes(
 def _run_together(
     policy: BasePolicy | LatentSafePolicy, world: VectorWorld, n_videos: int, seen: NearestFrames | None
 ) -> Episodes:
-    runs = _begun(world.info, world.render(n_videos))
-    for step in steps(world, PolicyActor(policy)):
+    runs, actor = _begun(world.info, world.render(n_videos)), PolicyActor(policy)
+    for step in steps(world, actor):
         alive, filmed = step.alive, np.flatnonzero(step.alive[:n_videos])
         if seen is not None and len(filmed):
             images = {key: values[filmed] for key, values in step.seen.items() if key.startswith(OBS_IMAGE)}
@@ -244,7 +252,7 @@ def _run_together(
         if step.decision is not None:
             _note_decision(runs, step.decision, alive)
             for i in filmed:
-                runs.latents[i].append(select(policy.shield.latent, slice(i, i + 1)))
+                runs.latents[i].append(select(actor.latent, slice(i, i + 1)))
         for i in np.flatnonzero(alive):
             _note_outcome(runs, i, step.info[i])
         _record(runs.traces, alive, action=step.action)
@@ -289,8 +297,8 @@ def _note_outcome(runs: Episodes, i: int, info: dict[str, Any]) -> None:
     """What the environment said of episode i after a step."""
     _note_state(runs, i, info)
     runs.success[i] = bool(info["is_success"])
-    if "spill_fraction" in info:
-        runs.severity[i] = np.fmax(runs.severity[i], info["spill_fraction"])
+    if "severity" in info:
+        runs.severity[i] = np.fmax(runs.severity[i], info["severity"])
 
 
 def _record(traces: list[dict[str, list]], alive: np.ndarray, **columns: np.ndarray | torch.Tensor) -> None:

@@ -52,9 +52,10 @@ def law_of(path: str) -> LawConfig:
 
 def in_use(settings: list[FilterSetting]) -> dict[str, dict]:
     """Path -> what a table notes of a filter beside its rates, under the names that results have had from the first."""
-    rows = {s.path: {"epsilon": s.epsilon, "guard": s.proposal_steps, "release": s.resume_above} for s in settings}
-    for path, row in rows.items():
-        own = law_of(path)
+    rows: dict[str, dict] = {}
+    for setting in settings:
+        row, own = rows.setdefault(setting.path, {}), law_of(setting.path)
+        row |= {"epsilon": setting.epsilon, "guard": setting.proposal_steps, "release": setting.resume_above}
         row |= {"memory": own.history_frames} if own.history_frames else {}
         if own.retreat:
             row |= {"retreat": own.retreat, "patience": own.retreat_after, "dwell": own.min_retreat_steps}

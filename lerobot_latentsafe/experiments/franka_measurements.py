@@ -139,9 +139,8 @@ def leak(n: int) -> dict:
             scene.step(action)
         seen.append(scene.proprioception())
         closed.append(end)
-    seen, closed = np.array(seen, float), np.array(closed)
-    half = n // 2
-    auc = area_under_curve(closed[half:], logistic_scores(seen[:half], closed[:half], seen[half:]))
+    x, y, half = np.array(seen, float), np.array(closed), n // 2
+    auc = area_under_curve(y[half:], logistic_scores(x[:half], y[:half], x[half:]))
     return {"grasps": n, "held_out": n - half, "auc": auc, "distance_from_chance": abs(auc - 0.5)}
 
 

@@ -59,12 +59,14 @@ class OperatorActor:
     """
 
     def __init__(self, operator: Actions, filter: LatentSafePolicy | None = None):
-        self.operator, self.filter, self.action = operator, filter, np.zeros(7)
+        self.operator, self.filter = operator, filter
+        self.action: np.ndarray = np.zeros(7)
         if filter is not None:
             filter.reset()
 
     def __call__(self, batch: dict[str, Tensor]) -> Choice:
-        self.action = next(self.operator, np.append(np.zeros(6), self.action[6]))
+        still: np.ndarray = np.append(np.zeros(6), self.action[6])
+        self.action = next(self.operator, still)
         if self.filter is None:
             return Choice(self.action[None])
         decision = self.filter.shield(batch, torch.from_numpy(self.action).float()[None])

@@ -229,7 +229,7 @@ class BagScene(FrankaScene):
         return held[0] if held else None
 
     def truth(self) -> dict[str, float | bool]:
-        """Spilled candies, whether it is lifted and by what; see the base class."""
+        """Spilled candies, their share as severity, whether the bag is lifted and by what; see the base class."""
         spilled = int(self.spilled().sum())
         held = self.held_segment()
         lifted = held is not None and self.segment_position(held)[2] - _z() > self.lift_height
@@ -238,7 +238,7 @@ class BagScene(FrankaScene):
             "failure": spilled > 0,
             "is_success": bool(lifted and not spilled),
             "spilled": spilled,
-            "spill_fraction": spilled / self.n_candies,
+            "severity": spilled / self.n_candies,
             "lifted": bool(lifted),
             "grasp": -1 if held is None else held,
             "reward": float(lifted and not spilled),

@@ -36,7 +36,7 @@ def reach(scene: FrankaScene, target: np.ndarray, speed: float, gripper: float, 
     limit = action_limits(scene.fps)[1][5]
     for _ in range(10 * scene.fps):
         way = target - scene.controller.position
-        distance = np.linalg.norm(way)
+        distance = float(np.linalg.norm(way))
         turn = 0.0 if yaw is None else _turn_to(scene, yaw)
         if distance < 1e-3 and abs(turn) < 1e-2:
             return

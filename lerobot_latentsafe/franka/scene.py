@@ -6,9 +6,11 @@
 A scene is used through a LeRobot robot (`robots/franka_mujoco`) and through gymnasium (`franka_env.py`).
 """
 
+import copy
 import os
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import mink
 import mujoco
@@ -121,7 +123,7 @@ class FrankaScene:
         self.kinematics = InverseKinematics()
         self.tool = self.model.site("tcp").id
         self.fingers = [self.model.joint(f"finger_{side}").qposadr[0] for side in ("left", "right")]
-        self._renderer = None
+        self._renderer: mujoco.Renderer | None = None
         self._before = np.empty(mujoco.mj_stateSize(self.model, PHYSICS))
         self.controller = self._home()
         self.seed = 0
@@ -263,13 +265,16 @@ class FrankaScene:
         """Restore `extra_state`."""
 
     def truth(self) -> dict[str, float | bool]:
-        """Privileged: at least `margin` (< 0: failure), `failure`, `is_success`. Never an input of a policy."""
+        """Privileged: at least `margin` (< 0: failure), `failure`, `is_success`. Never an input of a policy.
+
+        Where one failure is worse than another, `severity` says how bad it is now, from 0 to 1.
+        """
         raise NotImplementedError
 
 
 def _copy(controller: Controller) -> Controller:
-    return Controller(*(np.copy(v) if isinstance(v := getattr(controller, f.name), np.ndarray) else v
-                        for f in fields(controller)))  # fmt: skip
+    values: dict[str, Any] = {f.name: copy.copy(getattr(controller, f.name)) for f in fields(controller)}
+    return Controller(**values)
 
 
 def _make_renderer(model: mujoco.MjModel, size: int) -> mujoco.Renderer:

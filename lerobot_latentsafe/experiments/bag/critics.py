@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-from torch import Tensor
+from torch import Tensor, nn
 
 from lerobot_latentsafe.critic import SafetyCritic
 from lerobot_latentsafe.datasets.clips import ClipReader, FilterData
@@ -18,7 +18,7 @@ from lerobot_latentsafe.reachability import LatentReachability, look_ahead
 from lerobot_latentsafe.safety_model import SafetyModel
 from lerobot_latentsafe.training import covered_actions, encoded_starts, load_with_cache
 
-VARIANTS = {
+VARIANTS: dict[str, dict] = {
     "as configured": {},
     "16 components": {"components": 16},
     "caution 2": {"caution": 2.0},
@@ -120,8 +120,9 @@ def train_variant(
     policy, reader = load_with_cache(path, meta, seed)
     model, config = policy.model.requires_grad_(False), policy.config
     if name == SATURATED:
-        model.margin.net[-1].weight.mul_(2.8)
-        model.margin.net[-1].bias.mul_(2.8)
+        last: nn.Linear = model.margin.net[-1]
+        last.weight.mul_(2.8)
+        last.bias.mul_(2.8)
     low, high = covered_actions(model, reader, config.reachability.coverage)
     config.change(
         fallback=replace(config.fallback, low=low, high=high),

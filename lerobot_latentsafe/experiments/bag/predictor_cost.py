@@ -4,11 +4,12 @@ import importlib
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import draccus
 import torch
 import yaml
-from torch import Tensor, nn
+from torch import Tensor
 
 from lerobot_latentsafe.datasets.clips import Clip
 from lerobot_latentsafe.evaluation.statistics import provenance
@@ -25,12 +26,12 @@ DROPOUT = 0.1
 TOLERANCE = 1e-5
 
 
-def authors_predictor(path: Path, n_patches: int, config: DinoWMConfig, dim: int) -> nn.Module:
+def authors_predictor(path: Path, n_patches: int, config: DinoWMConfig, dim: int) -> Any:
     """Their ViTPredictor on the CPU; it names the GPU in one place, which is read as the CPU."""
     if not (path / "models" / "vit.py").exists():
         raise SystemExit(f"--authors={path} lacks models/vit.py; give a clone of gaoyuezhou/dino_wm")
     sys.path.insert(0, str(path))
-    vit = importlib.import_module("models.vit")
+    vit: Any = importlib.import_module("models.vit")
     to = Tensor.to
     Tensor.to = lambda self, *args, **options: self if args == ("cuda",) else to(self, *args, **options)
     try:
@@ -41,7 +42,7 @@ def authors_predictor(path: Path, n_patches: int, config: DinoWMConfig, dim: int
         Tensor.to = to
 
 
-def copy_weights(ours: FrameTransformer, theirs: nn.Module) -> None:
+def copy_weights(ours: Any, theirs: Any) -> None:
     """Make ours compute what theirs does, but for the embeddings of their frames."""
     ours.angle.zero_()
     ours.norm.load_state_dict(theirs.norm.state_dict())
@@ -55,7 +56,7 @@ def copy_weights(ours: FrameTransformer, theirs: nn.Module) -> None:
             to.load_state_dict(source.state_dict())
 
 
-def paper_steps(path: Path) -> tuple[dict[str, Callable[[], None]], float]:
+def paper_steps(path: Path) -> tuple[dict[str, Callable[[], object]], float]:
     """What is timed at the paper's size, and the largest difference of outputs."""
     config = paper_config()
     n, history, dim = 256, config.history, config.dim
@@ -83,7 +84,7 @@ def paper_steps(path: Path) -> tuple[dict[str, Callable[[], None]], float]:
     }, difference
 
 
-def compact_steps(path: Path, n_episodes: int) -> dict[str, tuple[Callable[[], None], int, int]]:
+def compact_steps(path: Path, n_episodes: int) -> dict[str, tuple[Callable[[], object], int, int]]:
     """What is timed at the compact size, how often a round, and the episodes that each call advances by a step."""
     config = DinoWMConfig()
     n_patches, token_dim = 36, 224
@@ -95,11 +96,11 @@ def compact_steps(path: Path, n_episodes: int) -> dict[str, tuple[Callable[[], N
         latents = {name: value[:, -1] for name, value in model.encode(clip).items()}
         one = {name: value.clone() for name, value in select(latents, slice(1)).items()}
     action, seen = clip.action[:, -1], torch.arange(1, config.history + 1)[None]
-    frames = [t[:1, : config.history] for t in (clip.percepts["tokens"], clip.state, clip.action)]
+    tokens, state, before = (t[:1, : config.history] for t in (clip.percepts["tokens"], clip.state, clip.action))
     return {
         "batch": (torch.no_grad()(lambda: model.step(latents, action)), 4, n_episodes),
         "one": (torch.no_grad()(lambda: model.step(one, action[:1])), n_episodes, 1),
-        "one_window": (torch.no_grad()(lambda: model._advance(*frames, seen)), n_episodes, 1),
+        "one_window": (torch.no_grad()(lambda: model._advance(tokens, state, before, seen)), n_episodes, 1),
         "authors_compact": (lambda: theirs.train()(window), n_episodes, 1),
     }
 
@@ -122,7 +123,7 @@ def random_clip(batch: int, length: int, n_patches: int, token_dim: int) -> Clip
     )  # fmt: skip
 
 
-def trained_step(config: DinoWMConfig, batch: int, n_patches: int, token_dim: int) -> Callable[[], None]:
+def trained_step(config: DinoWMConfig, batch: int, n_patches: int, token_dim: int) -> Callable[[], object]:
     """One training step: loss, backward pass, clipping, AdamW."""
     model = DinoWM(config, CAMERAS, STATE_DIM, ACTION_DIM, n_patches, token_dim).train()
     optimizer = torch.optim.AdamW(model.parameters(), 5e-5, fused=True)
@@ -137,7 +138,7 @@ def trained_step(config: DinoWMConfig, batch: int, n_patches: int, token_dim: in
     return step
 
 
-def in_turn(functions: dict[str, tuple[Callable[[], None], int, int]], rounds: int) -> dict[str, list[float]]:
+def in_turn(functions: dict[str, tuple[Callable[[], object], int, int]], rounds: int) -> dict[str, list[float]]:
     """CPU milliseconds of each function, called so often a round, for each of the episodes that a call advances."""
     times: dict[str, list[float]] = {name: [] for name in functions}
     for _ in range(rounds + 1):
@@ -146,7 +147,7 @@ def in_turn(functions: dict[str, tuple[Callable[[], None], int, int]], rounds: i
     return {name: values[1:] for name, values in times.items()}
 
 
-def cpu_ms(function: Callable[[], None], calls: int) -> float:
+def cpu_ms(function: Callable[[], object], calls: int) -> float:
     """CPU milliseconds of a call, the mean of so many."""
     return 1e3 * sum(cpu_seconds(function) for _ in range(calls)) / calls
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 import torch
 import torch.distributed as dist
@@ -44,12 +45,13 @@ class Work:
 
 def training_steps(work: Work) -> Callable[[], int]:
     """Some gradient steps of the world model; returns the clips that all ranks learned from."""
-    policy, policy.reader = load_with_cache(work.policy, metadata(work))
+    policy, reader = load_with_cache(work.policy, metadata(work))
+    policy.reader = reader
     policy.train()
     several = world_size() > 1
     model = DistributedDataParallel(policy, find_unused_parameters=True) if several else policy
     optimizer = torch.optim.Adam(policy.get_optim_params(), 1e-4, fused=True)
-    n = len(policy.reader.labels.failure)
+    n = len(reader.labels.failure)
 
     def train() -> int:
         for _ in range(work.steps):
@@ -146,7 +148,7 @@ def measure(work: Work, rounds: int) -> dict:
                 rates[task][team].append(throughput(processes, task) * (2 if team == "two_alone" else 1))
     for orders in _all(teams):
         orders.send(None)
-    row = {
+    row: dict[str, Any] = {
         "what": "clips (world model) or backed-up states (reachability) a second of wall time, and ratios to one rank",
         "rounds": rounds,
         "threads_a_rank": 1,

@@ -53,7 +53,8 @@ class TimedActor:
     """
 
     def __init__(self, actor: Actor):
-        self.actor, self.cost = actor, []
+        self.actor = actor
+        self.cost: list[float] = []
 
     def __call__(self, seen: dict) -> Choice:
         began = time.process_time()
@@ -79,7 +80,8 @@ def drive(
         step of the first override or None; cost: CPU seconds of each decision; and step by step: value, margin,
         intervened, spilled (candies outside).
     """
-    actor = TimedActor(PolicyActor(policy) if operator is None else OperatorActor(operator, policy))
+    filter = policy if isinstance(policy, LatentSafePolicy) else None
+    actor = TimedActor(PolicyActor(policy) if operator is None else OperatorActor(operator, filter))
     world = SceneWorld(scene, n_steps or STEPS, () if policy is None and frames is None else CAMERAS)
     decisions, truths = [], []
     for step in steps(world, actor):

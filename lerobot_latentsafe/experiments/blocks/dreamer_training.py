@@ -7,6 +7,7 @@ so a run that was killed goes on from its last checkpoint as if nothing had happ
 import json
 import shutil
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.optim.optimizers import load_optimizer_state, save_optimizer_state
 from torch import Tensor
+from torch.nn import Parameter
 
 from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
 from lerobot_latentsafe.datasets.clips import Clip
@@ -30,6 +32,7 @@ from lerobot_latentsafe.runtime.hub import save_policy
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
 from lerobot_latentsafe.safety_model import SafetyModel
 from lerobot_latentsafe.units import adopt_dataset
+from lerobot_latentsafe.world_models.rssm import RSSM
 
 OPTIONS, LOG = "options.json", "log.jsonl"
 
@@ -91,9 +94,11 @@ class TrainDreamer:
 
     @property
     def n_rounds(self) -> int:
+        """Rounds of the policy's own episodes."""
         return -(-(self.steps - self.pretraining) // self.collect_every)
 
     def run(self) -> None:
+        """Train, or go on training, and say where the results are."""
         DreamerTraining(self).run()
         print(f"task policy in {self.output_dir / 'policy'}, its episodes in {self.output_dir / 'episodes'}")
 
@@ -200,11 +205,12 @@ class DreamerTraining:
         # Cloning shapes the latents, too: the few pixels that tell where to grasp weigh little in the images' error.
         cloning_loss = policy.cloning_loss(features, meant, clip.valid & demonstrated[:, None])
         features = features.detach()
-        start = policy.model.world_model.latent_of(features.flatten(0, 1)[starts], clip.action.flatten(0, 1)[starts])
+        world_model: RSSM = policy.model.world_model
+        start = world_model.latent_of(features.flatten(0, 1)[starts], clip.action.flatten(0, 1)[starts])
         actor_loss, critic_loss, imagined = policy.behavior_losses(start)
         (loss + critic_loss + weights[0] * actor_loss + weights[1] * cloning_loss).backward()
         metrics = {"loss": loss, "loss_cloning": cloning_loss, **metrics, **imagined}
-        return {name: value.detach() for name, value in metrics.items()}
+        return {name: torch.as_tensor(value).detach() for name, value in metrics.items()}
 
     def _descend(self, name: str) -> None:
         """A gradient step; step sizes rise over the first 100 steps, and fall to nothing over the last fifth."""
@@ -284,14 +290,14 @@ class DreamerTraining:
             self.backpropagate = Replayed(self._backpropagate, changed)
         config, model = policy.config.behavior, policy.model
         learned = [*model.world_model.parameters(), *model.margin.parameters(), *policy.reward.parameters()]
-        parts = {
+        actor, critic = list(policy.actor.parameters()), list(policy.critic.parameters())
+        parts: dict[str, list[tuple[Iterable[Parameter], float]]] = {
             "model": [(learned, config.model_lr)],
-            "behavior": [(policy.actor.parameters(), config.actor_lr), (policy.critic.parameters(), config.critic_lr)],
+            "behavior": [(actor, config.actor_lr), (critic, config.critic_lr)],
         }
         self.step_sizes = {name: [lr for _, lr in groups] for name, groups in parts.items()}
         self.optimizers = {
-            name: torch.optim.Adam([{"params": list(p)} for p, _ in groups], fused=True)
-            for name, groups in parts.items()
+            name: torch.optim.Adam([{"params": p} for p, _ in groups], fused=True) for name, groups in parts.items()
         }
 
     def _checkpoints(self) -> list[Path]:

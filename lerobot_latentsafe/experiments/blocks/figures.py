@@ -53,8 +53,8 @@ def trade_off(curves: dict[str, list[dict]], bare: dict) -> Figure:
 def leads(distribution: list[int]) -> Figure:
     """Histogram of how many steps V warns before l sees the failure."""
     figure, ax = plt.subplots(figsize=(5.2, 3.2))
-    ax.hist(distribution, bins=np.arange(min(distribution) - 0.5, max(distribution) + 1.5), color="tab:blue")
-    ax.axvline(np.median(distribution), color="k", ls="--", label=f"median {np.median(distribution):g}")
+    ax.hist(distribution, bins=np.arange(min(distribution) - 0.5, max(distribution) + 1.5).tolist(), color="tab:blue")
+    ax.axvline(float(np.median(distribution)), color="k", ls="--", label=f"median {np.median(distribution):g}")
     ax.set(xlabel="steps from the first V <= epsilon to the first l < 0", ylabel="failing rollouts")
     ax.legend()
     return figure

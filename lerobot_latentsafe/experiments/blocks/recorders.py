@@ -138,7 +138,7 @@ class _Exploring:
 
     def __init__(self, policy: LatentSafeDreamerPolicy, rng: np.random.Generator | None):
         policy.reset()
-        self.policy, self.straying = policy, rng and _Straying(rng, 0.06)
+        self.policy, self.straying = policy, None if rng is None else _Straying(rng, 0.06)
 
     def __call__(self, batch: dict[str, Tensor]) -> np.ndarray:
         action = self.policy.act(batch, explore=True)
@@ -150,6 +150,10 @@ class _Exploring:
                 action = self.policy.model.units.denormalise_action(moved)
                 self.policy.was_overridden(action)
         return action.cpu().numpy()
+
+
+_recorder: Recorder
+"""Of this process, if it is a worker."""
 
 
 def _start(seed: int, image_size: int) -> None:

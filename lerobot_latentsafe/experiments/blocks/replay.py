@@ -125,7 +125,7 @@ class Replay:
         labels = FailureLabels(
             self.arrays["failure"][:n], np.zeros(n, np.int8), np.repeat(np.arange(n_episodes), self.length)
         )
-        cache = FrameCache(self.percepts, {}, self.arrays["state"], self.arrays["action"], {})
+        cache = FrameCache({**self.percepts}, {}, self.arrays["state"], self.arrays["action"], {})
         return ClipReader(labels, cache, clip_length, units)
 
     def statistics(self, n_episodes: int) -> dict[str, dict[str, np.ndarray]]:

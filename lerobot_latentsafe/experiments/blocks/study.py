@@ -83,13 +83,13 @@ def run_filmed(job: dict) -> tuple[dict, list[np.ndarray]]:
     env, policy = blocks_env(), load(job["dreamer"], job["filter"], job["mode"], job["epsilon"])
     torch.manual_seed(job["seed"])
     world = EnvironmentsWorld([env], [job["seed"]])
-    bound = LookaheadActor(policy, env.scene) if job["mode"] == "lookahead" else None
+    actor, bound = PolicyActor(policy), LookaheadActor(policy, env.scene) if job["mode"] == "lookahead" else None
     frames, latents, overridden, lifted = [], [], 0, False
-    for step in steps(world, bound or PolicyActor(policy)):
+    for step in steps(world, bound or actor):
         frames.append(picture(step.seen[FRONT]))
         if step.decision is not None:
             overridden += bool(step.decision.intervened)
-            latents.append(policy.shield.latent)
+            latents.append(actor.latent)
         lifted |= step.info[0]["lifted"]
     (info,) = world.info
     failed = info["failure"]
@@ -98,7 +98,7 @@ def run_filmed(job: dict) -> tuple[dict, list[np.ndarray]]:
         "leaning": bool(info["tilt"] > POINT_OF_NO_RETURN) and not failed, "steps": env.steps,
         "overridden": bound.overridden if bound else overridden,
     }  # fmt: skip
-    if job["mode"] == "monitor" and failed:
+    if job["mode"] == "monitor" and failed and isinstance(policy, LatentSafePolicy):
         row |= {name: column.tolist() for name, column in zip(("margin", "value"), values_of(policy.model, latents))}
     return row, frames
 

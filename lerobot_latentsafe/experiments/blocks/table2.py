@@ -1,6 +1,7 @@
 """Table 2: the blocks' task policy bare, under SQRL, under the latent safety filter, and under the simulator itself."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -82,7 +83,7 @@ def table_cells(dreamer: str, filters: list[str], risks: list[str], n: int, n_cu
     }
 
 
-def method_rows(ran: dict[object, Rows]) -> dict:
+def method_rows(ran: dict[Any, Rows]) -> dict:
     """The rows of the table: outcomes of each method, and tests against the bare policy."""
     methods = {}
     for name in ("dreamer", *(f"sqrl_{r:g}" for r in RISKS), "latentsafe", "lookahead"):
@@ -91,7 +92,7 @@ def method_rows(ran: dict[object, Rows]) -> dict:
     return methods
 
 
-def threshold_curves(ran: dict[object, Rows], filters: list[str], risks: list[str]) -> dict:
+def threshold_curves(ran: dict[Any, Rows], filters: list[str], risks: list[str]) -> dict:
     """Outcomes as the threshold of each kind of filter varies."""
     return {
         title: [{"threshold": x, **rates([ran[kind, x, path] for path in paths])} for x in thresholds]
@@ -111,8 +112,9 @@ def lead_row(jobs: list[dict], watched: Rows, folder: Path) -> dict:
         save(leads(found), folder / "lead.png")
     if shown is not None:
         _, frames = run_filmed(jobs[shown])
-        curves = (np.array(watched[shown][name]) for name in ("margin", "value"))
-        save(unsafe_rollout(frames, *curves, EPSILON, SCENES["blocks"].fps), folder / "unsafe_rollout.png")
+        margin, value = (np.array(watched[shown][name]) for name in ("margin", "value"))
+        figure = unsafe_rollout(frames, margin, value, EPSILON, SCENES["blocks"].fps)
+        save(figure, folder / "unsafe_rollout.png")
     return row
 
 

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from lerobot_latentsafe.dubins.car import TURN_RATES
@@ -32,7 +31,7 @@ def write_ablation(left_only: str, full: str, folder: Path) -> None:
         rows[name] = {
             "against_left_only_truth": confusion(~unsafe, two > 0),
             "against_full_truth": confusion(~unsafe, three > 0),
-            "right_turn_only_called_unsafe": wilson(np.sum(unsafe & needs_right), needs_right.sum()),
+            "right_turn_only_called_unsafe": wilson(int((unsafe & needs_right).sum()), int(needs_right.sum())),
         }
         print(name, rows[name]["right_turn_only_called_unsafe"], rows[name]["against_left_only_truth"]["f1_unsafe"])
     write_json(folder / "ablation.json", {**provenance([0]), "rows": rows})

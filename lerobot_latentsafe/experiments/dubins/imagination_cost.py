@@ -5,6 +5,7 @@ import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -49,7 +50,8 @@ def authors_rate(env: TimeLimit, n_steps: int, continues: bool) -> float:
     Args:
         continues: whether episodes last until their limit, or one step only.
     """
-    bias = env.unwrapped.wm.heads["cont"].mean_layer.bias
+    theirs: Any = env.unwrapped
+    bias = theirs.wm.heads["cont"].mean_layer.bias
     torch.nn.init.constant_(bias, 20.0 if continues else -20.0)
     actions = np.random.default_rng(0).uniform(-1, 1, (n_steps, 1)).astype(np.float32)
     began, over = time.process_time(), True

@@ -20,6 +20,7 @@ class DubinsImagination:
         self.half_width = half_width
 
     def step(self, latent: Latent, action: Tensor) -> Latent:
+        """One Euler step under actions (B, 1) in [-1, 1]."""
         x, y, heading = latent["state"].unbind(-1)
         return {
             "state": torch.stack(
@@ -33,16 +34,20 @@ class DubinsImagination:
         }
 
     def features(self, latent: Latent) -> Tensor:
+        """Position, and the heading's cosine and sine: (B, 4)."""
         x, y, heading = latent["state"].unbind(-1)
         return torch.stack([x, y, torch.cos(heading), torch.sin(heading)], -1)
 
     def margin(self, latent: Latent) -> Tensor:
+        """l(s) in m^2: (B,)."""
         return latent["state"][..., :2].square().sum(-1) - car.RADIUS**2
 
     def ended(self, latent: Latent) -> Tensor:
+        """Whether the car has left the view: bool (B,)."""
         return latent["state"][..., :2].abs().amax(-1) > self.half_width
 
     def complete(self, latent: Latent, action: Tensor) -> Tensor:
+        """The action: the car has no frozen commands."""
         return action
 
 

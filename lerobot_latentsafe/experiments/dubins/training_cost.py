@@ -121,10 +121,7 @@ def authors_step(folder: Path, options: TrainingCost) -> Callable[[], None]:
     authors, gym = authors_modules(options.authors), importlib.import_module("gym")
     config = authors_config(authors.tools, options.authors)
 
-    class Learner(authors.dreamer.Dreamer):
-        def fill_cache(self):
-            """Skip the thousands of figures they draw for a plot."""
-
+    authors.dreamer.Dreamer.fill_cache = lambda learner: None  # skip the thousands of figures they draw for a plot
     spaces = {
         "state": gym.spaces.Box(-np.inf, np.inf, (3,)),
         "obs_state": gym.spaces.Box(-1, 1, (2,)),
@@ -132,7 +129,7 @@ def authors_step(folder: Path, options: TrainingCost) -> Callable[[], None]:
     }
     logger = SimpleNamespace(step=0, scalar=lambda *a: None, write=lambda **k: None)
     action_space = gym.spaces.Box(-config.turnRate, config.turnRate, (1,))
-    learner = Learner(gym.spaces.Dict(spaces), action_space, config, logger, None)
+    learner = authors.dreamer.Dreamer(gym.spaces.Dict(spaces), action_space, config, logger, None)
     learner.requires_grad_(False)
     reader = fresh_policy(preset("paper"), folder, options.clip).reader
     window = whole_clips(reader.labels, options.batch, options.clip)[:, None] + np.arange(options.clip)

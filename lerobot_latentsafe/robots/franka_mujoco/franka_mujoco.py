@@ -7,6 +7,7 @@ from lerobot.robots.robot import Robot
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
 from lerobot_latentsafe.franka.actions import ACTION_NAMES, GRIPPER_NAME, JOINT_NAMES, STATE_NAMES, read_action
+from lerobot_latentsafe.franka.scene import FrankaScene
 from lerobot_latentsafe.franka.scenes import SCENES, make_scene
 from lerobot_latentsafe.robots.franka_device import FrankaDevice
 from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
@@ -34,7 +35,7 @@ class LatentSafeFrankaMujoco(FrankaDevice, Robot):
         super().__init__(config)
         self.config = config
         self.cameras = dict.fromkeys(CAMERAS)
-        self.scene = None
+        self.scene: FrankaScene | None = None
         self.episode = 0
         self._events = LeRobotEvents()
 
@@ -104,7 +105,7 @@ class LatentSafeFrankaMujoco(FrankaDevice, Robot):
         self._events.stop()
         _connected.remove(self)
         self.scene.close()
-        self.scene = None
+        self.scene: FrankaScene | None = None
 
     def _require_connection(self) -> None:
         if not self.is_connected:

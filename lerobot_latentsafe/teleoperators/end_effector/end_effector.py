@@ -105,7 +105,8 @@ class LatentSafeEndEffector(Teleoperator):
         if not said:
             self._held_at = None
             return still
-        mapped = MapPhoneActionToRobotAction(platform=self.config.device.phone_os).action(dict(said))
+        phone: Any = self.config.device
+        mapped = MapPhoneActionToRobotAction(platform=phone.phone_os).action(dict(said))
         self._opening = float(np.clip(self._opening + 0.1 * mapped["gripper_vel"], 0, 1))
         still[6] = self._opening
         if not mapped["enabled"]:
