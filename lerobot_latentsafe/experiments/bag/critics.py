@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-from torch import Tensor, nn
+from torch import Tensor
 
 from lerobot_latentsafe.critic import SafetyCritic
 from lerobot_latentsafe.datasets.clips import ClipReader, FilterData
@@ -120,9 +120,8 @@ def train_variant(
     policy, reader = load_with_cache(path, meta, seed)
     model, config = policy.model.requires_grad_(False), policy.config
     if name == SATURATED:
-        last: nn.Linear = model.margin.net[-1]
-        last.weight.mul_(2.8)
-        last.bias.mul_(2.8)
+        for parameter in model.margin.net[-1].parameters():
+            parameter.mul_(2.8)
     low, high = covered_actions(model, reader, config.reachability.coverage)
     config.change(
         fallback=replace(config.fallback, low=low, high=high),

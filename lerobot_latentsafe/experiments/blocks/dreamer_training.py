@@ -18,7 +18,6 @@ from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.optim.optimizers import load_optimizer_state, save_optimizer_state
 from torch import Tensor
-from torch.nn import Parameter
 
 from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
 from lerobot_latentsafe.datasets.clips import Clip
@@ -32,7 +31,6 @@ from lerobot_latentsafe.runtime.hub import save_policy
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
 from lerobot_latentsafe.safety_model import SafetyModel
 from lerobot_latentsafe.units import adopt_dataset
-from lerobot_latentsafe.world_models.rssm import RSSM
 
 OPTIONS, LOG = "options.json", "log.jsonl"
 
@@ -115,7 +113,8 @@ class DreamerTraining:
         n_episodes = options.demonstrations + options.n_rounds * options.n_envs
         device = options.model.device
         self.replay = Replay.open(self.folder / "replay", n_episodes, length, self.image_size, device)
-        self.started, self.coming = time.process_time(), []
+        self.started = time.process_time()
+        self.coming: Iterable[tuple[int, dict[str, np.ndarray]]] = []
         self._record_demonstrations()
         self._load() if self._checkpoints() else self._begin()
         if device == "cpu":
@@ -205,8 +204,7 @@ class DreamerTraining:
         # Cloning shapes the latents, too: the few pixels that tell where to grasp weigh little in the images' error.
         cloning_loss = policy.cloning_loss(features, meant, clip.valid & demonstrated[:, None])
         features = features.detach()
-        world_model: RSSM = policy.model.world_model
-        start = world_model.latent_of(features.flatten(0, 1)[starts], clip.action.flatten(0, 1)[starts])
+        start = policy.model.world_model.latent_of(features.flatten(0, 1)[starts], clip.action.flatten(0, 1)[starts])
         actor_loss, critic_loss, imagined = policy.behavior_losses(start)
         (loss + critic_loss + weights[0] * actor_loss + weights[1] * cloning_loss).backward()
         metrics = {"loss": loss, "loss_cloning": cloning_loss, **metrics, **imagined}
@@ -291,7 +289,7 @@ class DreamerTraining:
         config, model = policy.config.behavior, policy.model
         learned = [*model.world_model.parameters(), *model.margin.parameters(), *policy.reward.parameters()]
         actor, critic = list(policy.actor.parameters()), list(policy.critic.parameters())
-        parts: dict[str, list[tuple[Iterable[Parameter], float]]] = {
+        parts = {
             "model": [(learned, config.model_lr)],
             "behavior": [(actor, config.actor_lr), (critic, config.critic_lr)],
         }

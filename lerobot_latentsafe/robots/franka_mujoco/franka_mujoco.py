@@ -105,7 +105,7 @@ class LatentSafeFrankaMujoco(FrankaDevice, Robot):
         self._events.stop()
         _connected.remove(self)
         self.scene.close()
-        self.scene: FrankaScene | None = None
+        self.scene = None
 
     def _require_connection(self) -> None:
         if not self.is_connected:
