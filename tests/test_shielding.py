@@ -90,9 +90,9 @@ def test_steps_and_reasons_add_up(result):
     assert set(result["reasons"]) <= {reason.name.lower() for reason in Reason}
     acted = sum(sum(t["intervened"]) for t in episodes.traces)
     assert result["shielded"]["overridden_share"] == pytest.approx(acted / episodes.steps.sum())
-    for trace, steps in zip(episodes.traces, episodes.steps):
-        assert len(trace["value"]) == len(trace["action"]) == steps
-        assert len(trace["state"]) == steps + 1
+    for trace, n_steps in zip(episodes.traces, episodes.steps):
+        assert len(trace["value"]) == len(trace["action"]) == n_steps
+        assert len(trace["state"]) == n_steps + 1
 
 
 def test_frames_are_kept_of_the_episodes_asked_for(result):
