@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 import tiny
 import torch
-from lerobot_latentsafe.cli.options import DatasetSource, PolicySource
-from lerobot_latentsafe.cli.train import Calibrate
 
 from lerobot_latentsafe.calibration import calibrate, episode_values, store
+from lerobot_latentsafe.cli.options import DatasetSource, PolicySource
+from lerobot_latentsafe.cli.train import Calibrate
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.safety_model import UntrainedFilterError
 from lerobot_latentsafe.training import load_with_cache

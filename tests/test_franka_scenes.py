@@ -79,21 +79,21 @@ def test_an_episode_does_not_depend_on_those_before_it():
     used = make_scene("bag", image_size=64)
     for _ in play(used, "closed_end", seed=1, steps=40):
         pass
-    for scene in (used, fresh := make_scene("bag", image_size=64)):
-        for _ in play(scene, "closed_end", seed=2, steps=40):
+    for world in (used, fresh := make_scene("bag", image_size=64)):
+        for _ in play(world, "closed_end", seed=2, steps=40):
             pass
     np.testing.assert_array_equal(used.data.qpos, fresh.data.qpos)
 
 
 def test_equal_seeds_are_equal_and_others_are_not(bag_scene):
-    scenes = bag_scene, make_scene("bag", image_size=64)
-    for scene in scenes:
-        scene.reset(1)  # whatever happened before must not matter
-        scene.reset(5)
-        scene.step(np.array([0.01, 0, -0.01, 0, 0, 0, 1]))
-    np.testing.assert_array_equal(scenes[0].data.qpos, scenes[1].data.qpos)
-    scenes[1].reset(6)
-    assert np.abs(scenes[0].data.qpos - scenes[1].data.qpos).max() > 0.01
+    worlds = bag_scene, make_scene("bag", image_size=64)
+    for world in worlds:
+        world.reset(1)  # whatever happened before must not matter
+        world.reset(5)
+        world.step(np.array([0.01, 0, -0.01, 0, 0, 0, 1]))
+    np.testing.assert_array_equal(worlds[0].data.qpos, worlds[1].data.qpos)
+    worlds[1].reset(6)
+    assert np.abs(worlds[0].data.qpos - worlds[1].data.qpos).max() > 0.01
 
 
 @pytest.mark.parametrize("behavior", ["closed_end", "middle"])
