@@ -22,6 +22,7 @@ from lerobot.policies.utils import prepare_observation_for_inference
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.scripts.lerobot_train import train
 
+from lerobot_latentsafe._compat import quiet_decoder
 from lerobot_latentsafe.base_policy import BasePolicy
 from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
 from lerobot_latentsafe.datasets.build_cache import build_frame_cache
@@ -34,6 +35,8 @@ from lerobot_latentsafe.evaluation.rollouts import compare
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
 from lerobot_latentsafe.reports.figures import write_videos
 from lerobot_latentsafe.training import train_reachability
+
+quiet_decoder()  # a notebook has no other place to ask for it
 
 
 def shield_policy(
