@@ -24,7 +24,7 @@ STEPS = {"dubins": 36, "bag": 20, "blocks": 20}
 def drive(name: str) -> dict[str, np.ndarray]:
     """Observations (T, 2, ...) of two episodes, at the model's image size, and what the bare policy did (T, 2, A)."""
     torch.manual_seed(0)
-    base, policy = BasePolicy(POLICIES[name], "cpu"), LatentSafePolicy.from_pretrained(name)
+    base, policy = BasePolicy.load(POLICIES[name]), LatentSafePolicy.from_pretrained(name)
     env = next(iter(make_env(ENVS[name](), n_envs=2).values()))[0]
     observation, _ = env.reset(seed=SEEDS[name])
     base.reset()
@@ -34,7 +34,7 @@ def drive(name: str) -> dict[str, np.ndarray]:
         action = base.propose(batch)
         if t >= SKIP[name]:
             row = {"action": action.numpy(), "observation.state": batch["observation.state"].numpy()}
-            for key in policy.world_model.image_keys:
+            for key in policy.model.world_model.image_keys:
                 small = torch.nn.functional.interpolate(batch[key], (size, size), mode="area")
                 row[key] = (small * 255).round().byte().numpy()
             rows.append(row)

@@ -102,7 +102,7 @@ def test_a_diffusion_policy_plans_the_same_in_the_other_thread():
     observation["observation.image"] = torch.zeros(1, 3, 128, 128)
     actions = []
     for ahead in (0, 2):
-        base = BasePolicy("dubins_diffusion_reckless", "cpu", ahead)
+        base = BasePolicy.load("dubins_diffusion_reckless", ahead=ahead)
         torch.manual_seed(0)
         actions.append(torch.cat([base.propose(observation) for _ in range(4)]))
     assert torch.allclose(*actions, atol=1e-6)
