@@ -1,13 +1,16 @@
 """Apple's GPUs have no 64-bit floats: nothing on the way of a decision or a training step may need them."""
 
+import numpy as np
 import pytest
 import tiny
 import torch
+from test_decisions import FILE, FILTERS, decide_all
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from lerobot_latentsafe.modeling_latentsafe import load_filter
 from lerobot_latentsafe.reachability import LatentReachability
+from lerobot_latentsafe.shield import Shield
 from lerobot_latentsafe.training import encoded_starts
 
 MODELS = {"rssm": tiny.rssm_config, "gru": tiny.gru_config, "dino_wm": tiny.dino_wm_config}
@@ -62,3 +65,20 @@ def test_decisions_are_made_in_single_precision_whatever_the_robot_sends(tiny_co
         for action in (proposed, None):
             assert policy.shield(seen, action).action.dtype == torch.float32
     assert doubles.found == []
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_committed_filters_decide_in_single_precision(name, monkeypatch):
+    doubles = NoDoubles()
+    decide = Shield.__call__
+
+    def watched(*args, **kwargs):
+        with doubles:
+            return decide(*args, **kwargs)
+
+    monkeypatch.setattr(Shield, "__call__", watched)
+    with np.load(FILE) as recorded:
+        keys = [key for key in recorded if key.startswith(f"{name}/") and key.count("/") == 1]
+        decide_all(name, "committed", {key.removeprefix(f"{name}/"): recorded[key][:4] for key in keys})
+    assert doubles.found == []
+    assert not [key for key, value in load_filter(name).state_dict().items() if value.dtype == torch.float64]
