@@ -24,7 +24,7 @@ torch.set_num_threads(1)
 logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
 
 
-LONGEST = ("test_ranks.py", "test_pretrained.py", "test_labeling_page.py", "test_token_cache.py")
+LONGEST = ("test_distributed.py", "test_pretrained.py", "test_labeling_page.py", "test_token_cache.py")
 
 
 def pytest_collection_modifyitems(items):
