@@ -8,7 +8,7 @@ from typing import Any
 from safetensors.torch import load_file, save_file
 
 from lerobot_latentsafe.configuration_latentsafe import SEALED
-from lerobot_latentsafe.runtime.checkpoint import CONFIG, INTEGRITY, WEIGHTS, CheckpointError, seal
+from lerobot_latentsafe.runtime.checkpoint import CONFIG, INTEGRITY, WEIGHTS, CheckpointError, check_sealed, seal
 from lerobot_latentsafe.runtime.files import refuse_existing
 
 MOVED = {
@@ -35,6 +35,12 @@ MOVED = {
     },
 }  # fmt: skip
 """Entry of the flat configuration -> its group and name there."""
+
+SEALED_WHEN_FLAT = (
+    "world_model",
+    *(old for old, (group, _) in MOVED.items() if group in SEALED and old != "robot_type"),
+)
+"""Entries of the flat configuration that belonged to the weights."""
 
 
 def is_old(config: dict[str, Any]) -> bool:
@@ -67,13 +73,16 @@ def migrate_checkpoint(source: str | Path, output_dir: str | Path) -> list[str]:
 
     Raises:
         FileExistsError: output_dir exists.
-        CheckpointError: nothing there is of the old layout.
+        CheckpointError: nothing there is of the old layout, or it was cut or edited since it was saved.
     """
     source, output_dir = Path(source), Path(output_dir)
     refuse_existing(output_dir)
     folders = [file.parent.relative_to(source) for file in source.rglob(CONFIG) if is_old(json.loads(file.read_text()))]
     if not folders:
         raise CheckpointError(f"{source} holds no filter of the old layout; nothing was written")
+    for folder in folders:
+        if (source / folder / INTEGRITY).exists():
+            check_sealed(source / folder, SEALED_WHEN_FLAT)  # sealed anew, it would pass for what was saved
     shutil.copytree(source, output_dir)
     for folder in folders:
         _migrate_in_place(output_dir / folder)

@@ -11,7 +11,7 @@ from safetensors.torch import load_file, save_file
 
 from lerobot_latentsafe.base_policy import BasePolicy
 from lerobot_latentsafe.cli import main
-from lerobot_latentsafe.migration import MOVED, migrate_checkpoint
+from lerobot_latentsafe.migration import MOVED, SEALED_WHEN_FLAT, migrate_checkpoint
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
 from lerobot_latentsafe.runtime import checkpoint
 from lerobot_latentsafe.runtime.checkpoint import CheckpointError
@@ -31,7 +31,7 @@ def flatten(folder):
     assert all(name.startswith("model.") for name in tensors)
     tensors = {name.removeprefix("model."): tensor for name, tensor in tensors.items()}
     save_file(tensors, folder / "model.safetensors", {"format": "pt"})
-    checkpoint.seal(folder, sorted(set(flat) & {"world_model", "action_low", "stage", "kept_commands"}))
+    checkpoint.seal(folder, SEALED_WHEN_FLAT)
     return folder
 
 
@@ -171,6 +171,32 @@ def test_a_migrated_filter_is_sealed(old, tmp_path):
     tiny.rewrite_json(tmp_path / "new" / "config.json", trained_on={"fps": 5})
     with pytest.raises(CheckpointError, match="was edited"):
         load_filter(tmp_path / "new")
+
+
+def cut(old):
+    weights = old / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-4])
+
+
+def alter_a_weight(old):
+    weights = old / "model.safetensors"
+    content = bytearray(weights.read_bytes())
+    content[-1] ^= 1
+    weights.write_bytes(content)
+
+
+def alter_a_range(old):
+    tiny.rewrite_json(old / "config.json", action_high=[9.0, 9.0])
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"), [(cut, "truncated"), (alter_a_weight, "changed after saving"), (alter_a_range, "was edited")]
+)
+def test_what_was_cut_or_edited_is_not_sealed_anew(old, tmp_path, spoil, words):
+    spoil(old)
+    with pytest.raises(CheckpointError, match=words):
+        migrate_checkpoint(old, tmp_path / "new")
+    assert not (tmp_path / "new").exists()
 
 
 def test_nothing_is_overwritten_and_nothing_is_migrated_twice(old, tiny_filter, tmp_path):
