@@ -25,17 +25,7 @@ from lerobot_latentsafe.migration import MOVED
 
 logger = logging.getLogger(__name__)
 
-LAW = {
-    "law": "law.name",
-    "mode": "law.mode",
-    "epsilon": "law.epsilon",
-    "release": "law.resume_above",
-    "guard": "law.proposal_steps",
-    "retreat": "law.retreat",
-    "patience": "law.retreat_after",
-    "dwell": "law.min_retreat_steps",
-    "memory": "law.history_frames",
-}
+LAW = {old: f"law.{new}" for old, (group, new) in MOVED.items() if group == "law"}
 ROBOT = {f"robot.{old}": f"robot.{LAW[old]}" for old in ("mode", "epsilon", "release", "guard")}
 
 RENAMED: dict[str, dict[str, str]] = {
