@@ -82,10 +82,10 @@ class Pictures:
         """Nothing is needed beforehand."""
 
     def start(self, folder: Path) -> None:
-        """Read the principal components, and note their hash."""
+        """Nothing is needed then."""
 
     def perceive(self, images: dict[str, Tensor]) -> dict[str, np.ndarray]:
-        """Numbers of all frames of an episode: name -> (T, ...)."""
+        """The pictures of an episode: camera key -> uint8 (T, 3, S, S)."""
         return {key: (value * 255).round().to(torch.uint8).numpy() for key, value in images.items()}
 
 
