@@ -11,13 +11,16 @@ from typing import Any
 import torch
 from huggingface_hub import ModelCard
 from lerobot.configs.types import FeatureType, PolicyFeature
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor
 
 from lerobot_latentsafe._compat import NOT_AVERAGED
 from lerobot_latentsafe.base_policy import BasePolicy
 from lerobot_latentsafe.configuration_latentsafe import SEALED, LatentSafeConfig
+from lerobot_latentsafe.datasets.adoption import adopt_dataset, check_candidates
 from lerobot_latentsafe.datasets.clips import FilterData
+from lerobot_latentsafe.datasets.contract import Contract
 from lerobot_latentsafe.decision import FilterDecision, LawOptions, Reason
 from lerobot_latentsafe.model_card import make_model_card
 from lerobot_latentsafe.runtime.checkpoint import (
@@ -31,7 +34,6 @@ from lerobot_latentsafe.runtime.checkpoint import (
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
 from lerobot_latentsafe.safety_model import SafetyModel, UntrainedFilterError
 from lerobot_latentsafe.shield import Shield
-from lerobot_latentsafe.units import adopt_dataset, check_candidates
 
 logger = logging.getLogger(__name__)
 
@@ -62,7 +64,7 @@ class LatentSafePolicy(PreTrainedPolicy):
         super().__init__(config)
         data = None
         if dataset_meta is not None:
-            data = adopt(config, dataset_meta, dataset_stats or dataset_meta.stats)
+            data = adopt(config, dataset_meta)
         self.model = model or SafetyModel(config)
         config.validate_features()
         self.reader = None if data is None else data.reader(config.world_model.clip_length, self.model.units)
@@ -236,12 +238,13 @@ def load_filter(
     return policy
 
 
-def adopt(config: LatentSafeConfig, meta: Any, stats: dict) -> FilterData:
+def adopt(config: LatentSafeConfig, meta: LeRobotDatasetMetadata) -> FilterData:
     """Open a dataset for a filter, and take over what it tells: units, ranges, cameras, cache.
 
     Raises:
         UnlabelledDatasetError: no failure labels.
         FrameCacheError: a torn cache, or one of another dataset, image size or encoder.
+        MeaningError: what a command means cannot be told.
         ValueError: another robot, rate, range or camera than those trained on.
     """
     data = FilterData.open(
@@ -249,7 +252,7 @@ def adopt(config: LatentSafeConfig, meta: Any, stats: dict) -> FilterData:
         config.trained_on.cameras,
     )  # fmt: skip
     data.check_cameras({key: config.input_features[key].shape for key in data.cameras if key in config.input_features})
-    trained_on = adopt_dataset(config.trained_on, meta, stats)
+    trained_on = adopt_dataset(config.trained_on, Contract.read(meta))
     trained_on.cameras = list(data.cameras)
     check_candidates(config.fallback.action_candidates, trained_on, meta.repo_id)
     pictures = {key: PolicyFeature(FeatureType.VISUAL, shape) for key, shape in data.cameras.items()}

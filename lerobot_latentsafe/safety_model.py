@@ -95,7 +95,7 @@ class SafetyModel(nn.Module):
         units, fallback, candidates = self.units, self.config.fallback, None
         if fallback.action_candidates is not None:
             robots = torch.tensor(fallback.action_candidates, dtype=torch.float32, device=units.device)
-            candidates = units.normalise_action(robots)
+            candidates = units.normalise_motions(robots)
         bounds = fallback.bounds(units.action_names, units.action_varies & ~units.frozen)
         sizes = self.world_model.feature_dim, len(units.action_low), candidates, self.config.reachability
         return SafetyCritic(*sizes, *bounds, self.config.trained_on.target).to(self.device)
@@ -139,7 +139,7 @@ class SafetyModel(nn.Module):
         or what `law.name` says instead.
         """
         self.require_trained_for_law()
-        law, still = self.config.law, self.units.normalise_action(self.units.hold_action(1))
+        law, still = self.config.law, self.units.still
         if law.name == "margin":
             margin = self.imagination.margin(latent)
             return margin, self.imagination.complete(latent, still.expand(len(margin), -1))

@@ -8,11 +8,12 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
+from lerobot_latentsafe.datasets.adoption import adopt_dataset
 from lerobot_latentsafe.datasets.clips import Clip
+from lerobot_latentsafe.datasets.contract import Contract
 from lerobot_latentsafe.datasets.episodes import DatasetFrames
 from lerobot_latentsafe.latent import Latent, map_latent
 from lerobot_latentsafe.safety_model import SafetyModel
-from lerobot_latentsafe.units import adopt_dataset
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ def check_fit(model: SafetyModel, frames: DatasetFrames) -> None:
     """
     model.require_stage("world_model")
     trained_on = model.config.trained_on
-    adopt_dataset(trained_on, frames.meta, frames.meta.stats)
+    adopt_dataset(trained_on, Contract.read(frames.meta))
     missing = [camera for camera in trained_on.cameras if camera not in frames.cameras]
     if missing:
         raise ValueError(
@@ -105,5 +106,5 @@ def _model_inputs(model: SafetyModel, frames: DatasetFrames, episode: int) -> tu
     return (
         model.world_model.perceive(images),
         units.normalise_state(state),
-        units.normalise_action(action).clamp(-1, 1),
+        units.heard_action(action, state),
     )
