@@ -67,6 +67,8 @@ class TrainedOn:
     def __post_init__(self) -> None:
         if self.stage not in STAGES:
             raise ValueError(f"stage is {self.stage!r}; expected one of {', '.join(STAGES)}")
+        if self.fps is not None and self.fps == round(self.fps):
+            self.fps = round(self.fps)  # 15, not 15.0, wherever people read it
 
     def has_reached(self, stage: str) -> bool:
         """Whether training has come at least this far."""

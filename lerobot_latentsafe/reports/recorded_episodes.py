@@ -1,6 +1,7 @@
 """What `latentsafe record` stored under a filter, read back as episodes that a report can show."""
 
 import numpy as np
+import torch
 
 from lerobot_latentsafe.datasets.decisions import FILE, decision_columns
 from lerobot_latentsafe.datasets.episodes import DatasetFrames
@@ -16,7 +17,7 @@ class RecordedEpisodes:
 
     Attributes:
         episode: (N,) of each frame.
-        executed: (N, A) the action of each frame.
+        state, executed: (N, S) and (N, A), of each frame.
         decisions: proposed (N, A), value, margin, intervened, reason (N,) of each frame; see `decision_columns`.
 
     Raises:
@@ -26,10 +27,10 @@ class RecordedEpisodes:
     def __init__(self, model: SafetyModel, frames: DatasetFrames):
         check_fit(model, frames)
         self.model, self.frames = model, frames
-        stored = read_frames(frames.root, ["frame_index", "action"])
+        stored = read_frames(frames.root, ["frame_index", "action", "observation.state"])
         meant = np.isin(stored["episode_index"], frames.episodes)
         stored = {name: column[meant] for name, column in stored.items()}
-        self.episode, self.executed = stored["episode_index"], stored["action"]
+        self.episode, self.executed, self.state = (stored[k] for k in ("episode_index", "action", "observation.state"))
         self.decisions = decision_columns(frames.root / FILE, stored)
 
     @staticmethod
@@ -41,6 +42,8 @@ class RecordedEpisodes:
         """One episode; whether it succeeded or failed is not known here, and stands as no."""
         rows, no = self.episode == episode, np.zeros(1, bool)
         trace = {name: column[rows].tolist() for name, column in self.decisions.items()}
+        proposed, state = (torch.from_numpy(x[rows]).float() for x in (self.decisions["proposed"], self.state))
+        trace["heard"] = self.model.units.heard_action(proposed, state).tolist()
         change = np.linalg.norm(self.executed[rows] - self.decisions["proposed"][rows], axis=-1)
         latents, (length,) = encode_episodes(self.model, self.frames, [episode])
         return Episodes(

@@ -269,7 +269,8 @@ class DreamerTraining:
         options = self.options
         torch.manual_seed(number(options.seed, 0, 0))
         config, shape = options.model, (3, self.scene.image_size, self.scene.image_size)
-        known = replace(config.trained_on, cameras=list(CAMERA_KEYS), task=self.scene.task)
+        other = {"gripper.pos": "other"}  # the actor commands a width, not by how much the fingers move
+        known = replace(config.trained_on, cameras=list(CAMERA_KEYS), task=self.scene.task, meanings=other)
         config.change(
             input_features={
                 **{key: PolicyFeature(FeatureType.VISUAL, shape) for key in CAMERA_KEYS},

@@ -197,10 +197,10 @@ class LatentSafeShielded(Robot):
         """What is to be executed instead of an action, or that action itself."""
         names, shield, period = self._trained_on.action_names, self.filter.shield, 1.0 / self._trained_on.fps
         known = set(action) == set(names)
-        if self.config.unfiltered_moves and (self._between or not known) and all(map(math.isfinite, action.values())):
-            self._say_once("moves between episodes, or of other names, are not filtered (--robot.unfiltered_moves)")
-            self._decided_at = -math.inf
-            return action
+        passes = self.config.unfiltered_moves and (self._between or not known)
+        if (passes or (self._between and self._goes_to_places(action))) and all(map(math.isfinite, action.values())):
+            self._say_once("moves between episodes, or of other names, are not filtered; no joint may jump")
+            return self._bounded(action)
         if not known:
             return self._hold(action)
         if not self._fresh:
@@ -221,9 +221,28 @@ class LatentSafeShielded(Robot):
         """Whether LeRobot said that what comes belongs to no episode."""
         return isinstance(self._phase, str)
 
+    def _goes_to_places(self, action: dict[str, float]) -> bool:
+        """Whether an action holds targets only, such as LeRobot's return of an arm to its start."""
+        targets = {command.name for command in self._trained_on.commands if command.meaning == "target"}
+        return bool(action) and set(action) <= targets
+
+    def _bounded(self, action: dict[str, float]) -> dict[str, float]:
+        """A move that is not filtered: each of its targets goes no further at once than those of the data."""
+        self._decided_at = -math.inf
+        if self._observation is None:
+            self.get_observation()
+        bounded = dict(action)
+        for command in self._trained_on.commands:
+            name = command.name
+            if command.of_state is not None and name in action:
+                low, high = self._trained_on.motion_ranges[name]
+                start = self._moved.get(name, float(self._observation[command.of_state]))
+                bounded[name] = self._moved[name] = min(max(action[name], start + low), start + high)
+        return bounded
+
     def _carry_out(self, decision: FilterDecision, action: dict[str, float]) -> dict[str, float]:
         """The action of a decision on an action."""
-        if not decision.intervened.item():
+        if not decision.intervened.item() and torch.equal(decision.action, decision.proposed):
             return action
         if isinstance(self._phase, int) and not self._early:
             self._say_once(
@@ -232,7 +251,7 @@ class LatentSafeShielded(Robot):
         return dict(zip(self._trained_on.action_names, decision.action[0].tolist()))
 
     def _hold(self, action: dict[str, float]) -> dict[str, float]:
-        """Instead of a command of which the filter knows nothing: no motion, the frozen commands as they are."""
+        """Instead of a command of which the filter knows nothing: stay."""
         self._say_once(
             f"the filter knows nothing of a command of {', '.join(action)}: "
             "the robot holds still. --robot.unfiltered_moves=true lets such moves pass unfiltered"
@@ -240,9 +259,10 @@ class LatentSafeShielded(Robot):
         self._decided_at = -math.inf
         if self._observation is None:
             self.get_observation()
-        now, frozen = {**self._observation, **self._sent}, self.filter.config.fallback.frozen_commands
-        still = dict(zip(self._trained_on.action_names, self.filter.model.units.hold_action(1)[0].tolist()))
-        return {**still, **{name: float(now[name]) for name in frozen if name in now}}
+        names, units = self._trained_on.action_names, self.filter.model.units
+        told = torch.tensor([[float(self._sent.get(name, math.nan)) for name in names]])
+        state = torch.from_numpy(self._frame()[OBS_STATE])[None]
+        return dict(zip(names, units.hold(state.to(units.device), told.to(units.device))[0].tolist()))
 
     # -- what the filter is told ---
 
@@ -302,6 +322,7 @@ class LatentSafeShielded(Robot):
         self._observation, self._fresh, self._seen_at = None, False, 0.0
         self._phase = None
         self._sent_early = None
+        self._moved: dict[str, float] = {}
         self._decided_at = None
         self._gaps: deque[float] = deque(maxlen=RATE_DECISIONS)
         self._cameras: dict[str, dict] = {}
