@@ -48,9 +48,9 @@ def channels_first(key: str, feature: dict) -> tuple[int, int, int]:
     ends = [end for end in (0, 2) if len(shape) == 3 and shape[end] in CHANNELS]
     if not ends:
         raise DatasetContractError(
-            f"camera {key} has shape {shape}; expected (height, width, channels) or (channels, height, width) with 1 or 3 "
-            "channels. Convert its pictures, or leave it out with lerobot-edit-dataset --operation.type=remove_feature "
-            f"--operation.feature_names='[{key}]'"
+            f"camera {key} has shape {shape}; expected (height, width, channels) or (channels, height, width) with 1 or "
+            "3 channels. Convert its pictures, or leave it out with lerobot-edit-dataset "
+            f"--operation.type=remove_feature --operation.feature_names='[{key}]'"
         )
     names = feature.get("names")
     first = isinstance(names, list | tuple) and len(names) == 3 and str(names[0]).startswith("channel")

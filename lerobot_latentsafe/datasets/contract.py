@@ -1,6 +1,6 @@
 """What a dataset says of its robot, settled in one place before any work: everybody else asks here.
 
-Datasets in the world differ in how they name their numbers, order a picture's axes, store depth, and in what is missing.
+Datasets in the world differ in how they name their numbers, order a picture's axes, store depth, and in what they lack.
 A `Contract` is what remains when that is settled; a dataset that has none is refused with a remedy.
 """
 
@@ -109,8 +109,8 @@ def check_features(meta: "LeRobotDatasetMetadata") -> None:
         )
     if ACTION not in meta.features:
         raise DatasetContractError(
-            f"{meta.repo_id} has no feature {ACTION!r}; its features are {', '.join(meta.features)}. Rename the one that "
-            f"holds the robot's commands: {rename_command(meta.root, {'<feature>': ACTION})}"
+            f"{meta.repo_id} has no feature {ACTION!r}; its features are {', '.join(meta.features)}. Rename the one "
+            f"that holds the robot's commands: {rename_command(meta.root, {'<feature>': ACTION})}"
         )
 
 
@@ -176,8 +176,8 @@ def _seconds_apart(meta: "LeRobotDatasetMetadata", frames: dict[str, np.ndarray]
         if videos and not apart * fps <= MOST_APART:
             raise DatasetContractError(
                 f"the timestamp of frame {frames['frame_index'][at]} of episode {frames['episode_index'][at]} of "
-                f"{meta.repo_id} is {apart * fps:.2f} frames from its place at {fps:g} Hz, so that its picture would be "
-                f"another's; expected frame_index / fps, and at most {MOST_APART} frames off. Correct fps in {INFO} or "
+                f"{meta.repo_id} is {apart * fps:.2f} frames from its place at {fps:g} Hz, so that its picture would "
+                f"be another's; expected frame_index / fps, and at most {MOST_APART} frames off. Correct fps in {INFO} or "
                 "the column timestamp in data/, or convert the dataset again"
             )
     for key in videos:
@@ -186,8 +186,8 @@ def _seconds_apart(meta: "LeRobotDatasetMetadata", frames: dict[str, np.ndarray]
         at = int(np.argmax(np.where(np.isfinite(late), late, np.inf)))
         if not late[at] <= MOST_APART:
             raise DatasetContractError(
-                f"episode {at} of {meta.repo_id} begins {late[at]:.2f} frames beside a frame of {key}'s video; expected "
-                f"a multiple of 1/{fps:g} s as from_timestamp in meta/episodes. Convert the dataset again"
+                f"episode {at} of {meta.repo_id} begins {late[at]:.2f} frames beside a frame of {key}'s video; "
+                f"expected a multiple of 1/{fps:g} s as from_timestamp in meta/episodes. Convert the dataset again"
             )
     return apart
 
