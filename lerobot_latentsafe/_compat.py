@@ -2,6 +2,7 @@
 
 import logging
 import re
+import sys
 from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,6 +11,7 @@ import pyarrow.parquet as pq
 
 if TYPE_CHECKING:
     from lerobot.configs.policies import PreTrainedConfig
+    from lerobot.configs.train import TrainPipelineConfig
     from lerobot.policies.pretrained import PreTrainedPolicy
 
 RECORDING = re.compile(r"Recording episode (\d+)$")
@@ -26,6 +28,17 @@ NOT_AVERAGED = "_ddp_params_and_buffers_to_ignore"
 def quiet_decoder() -> None:
     """torchcodec without system FFmpeg logs a page of traceback; LeRobot then falls back to pyav by itself."""
     logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
+
+
+def training_run() -> "TrainPipelineConfig | None":
+    """The options of the lerobot-train that is making a policy just now, if any: LeRobot hands them to no policy."""
+    frame = sys._getframe(1)
+    while frame is not None:
+        options = frame.f_locals.get("cfg")
+        if type(options).__name__ == "TrainPipelineConfig":
+            return options
+        frame = frame.f_back
+    return None
 
 
 def drop_episode_statistics(root: Path, features: list[str]) -> None:

@@ -13,6 +13,7 @@ from huggingface_hub import ModelCard
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
 from lerobot_latentsafe._compat import NOT_AVERAGED
@@ -20,7 +21,6 @@ from lerobot_latentsafe.base_policy import BasePolicy
 from lerobot_latentsafe.configuration_latentsafe import SEALED, LatentSafeConfig
 from lerobot_latentsafe.datasets.adoption import adopt_dataset, check_candidates
 from lerobot_latentsafe.datasets.clips import FilterData
-from lerobot_latentsafe.datasets.contract import Contract
 from lerobot_latentsafe.decision import FilterDecision, LawOptions, Reason
 from lerobot_latentsafe.model_card import make_model_card
 from lerobot_latentsafe.runtime.checkpoint import (
@@ -251,16 +251,22 @@ def adopt(config: LatentSafeConfig, meta: LeRobotDatasetMetadata) -> FilterData:
         meta, config.margin.failure_specification, config.frame_cache, config.world_model.image_size,
         config.trained_on.cameras,
     )  # fmt: skip
-    data.check_cameras({key: config.input_features[key].shape for key in data.cameras if key in config.input_features})
-    trained_on = adopt_dataset(config.trained_on, Contract.read(meta))
+    if config.trained_on.action_low is not None:  # else LeRobot has just read the shapes from the same dataset
+        data.check_cameras({key: config.input_features[key].shape for key in data.cameras})
+    trained_on = adopt_dataset(config.trained_on, data.contract)
     trained_on.cameras = list(data.cameras)
     check_candidates(config.fallback.action_candidates, trained_on, meta.repo_id)
-    pictures = {key: PolicyFeature(FeatureType.VISUAL, shape) for key, shape in data.cameras.items()}
+    features = {key: feature for key, feature in config.input_features.items() if key not in data.contract.left_out}
+    features |= {key: PolicyFeature(FeatureType.VISUAL, shape) for key, shape in data.cameras.items()}
+    if data.contract.state_names:
+        features[OBS_STATE] = PolicyFeature(FeatureType.STATE, (len(data.contract.state_names),))
+    actions = {ACTION: PolicyFeature(FeatureType.ACTION, (len(data.contract.action_names),))}
     world_model = config.world_model
     config.change(
         trained_on=trained_on,
         world_model=world_model if data.cache is None else world_model.of_cache(data.cache.manifest),
         frame_cache=data.frame_cache,
-        input_features={**config.input_features, **pictures},
+        input_features=features,
+        output_features={**config.output_features, **actions},
     )
     return data

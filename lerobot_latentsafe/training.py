@@ -12,7 +12,6 @@ from tqdm import trange
 from lerobot_latentsafe.critic import BACKUPS
 from lerobot_latentsafe.datasets.adoption import adopt_dataset
 from lerobot_latentsafe.datasets.clips import ClipReader, FilterData
-from lerobot_latentsafe.datasets.contract import Contract
 from lerobot_latentsafe.latent import Latent, map_latent, select
 from lerobot_latentsafe.margin import FailureMargin, hinge_loss
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
@@ -124,10 +123,10 @@ def load_with_cache(path: str | Path, dataset_meta, seed: int = 0) -> tuple[Late
     policy = load_filter(path)
     config, trained_on = policy.config, policy.config.trained_on
     policy.model.require_stage("world_model")
-    adopt_dataset(trained_on, Contract.read(dataset_meta))
     # The cache of the first stage may be gone; the dataset brings its own.
     specification, size = config.margin.failure_specification, config.world_model.image_size
     data = FilterData.open(dataset_meta, specification, None, size, trained_on.cameras)
+    adopt_dataset(trained_on, data.contract)
     data.check_cameras({key: config.input_features[key].shape for key in data.cameras})
     reader = data.reader(config.world_model.clip_length, policy.model.units)
     reader.require_cache()

@@ -82,6 +82,7 @@ RENAMED_VERBS = {"picture-features": "draw-features"}
 INTRODUCTION = """Latent safety filters for LeRobot.
 
 usage: latentsafe <verb> [--option=value ...]      latentsafe <verb> --help shows an example and all options
+                                                   --debug shows where an error was raised
 
 From episodes to a shielded policy:
   1. latentsafe collect --source=random --dataset.repo_id=me/car --dataset.root=data/car    (or lerobot-record)
@@ -110,7 +111,9 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
 def main(argv: list[str] | None = None) -> None:
     """Entry point of the console command `latentsafe`."""
     os.environ.setdefault("MPLBACKEND", "Agg")  # pictures are written, never shown
-    verb, *options = (sys.argv[1:] if argv is None else argv) or ["--help"]
+    typed = sys.argv[1:] if argv is None else argv
+    debug = "--debug" in typed
+    verb, *options = [word for word in typed if word != "--debug"] or ["--help"]
     if verb in ("-h", "--help", "help"):
         if not options:
             return print(overview())
@@ -123,4 +126,4 @@ def main(argv: list[str] | None = None) -> None:
         meant = nearest(verb, VERBS)
         hint = f"did you mean {meant}? latentsafe --help lists all" if meant else f"expected one of {', '.join(VERBS)}"
         sys.exit(f"latentsafe: unknown verb {verb!r}; {hint}")
-    importlib.import_module("lerobot_latentsafe.cli.command_line").run(verb, VERBS[verb], options)
+    importlib.import_module("lerobot_latentsafe.cli.command_line").run(verb, VERBS[verb], options, debug)

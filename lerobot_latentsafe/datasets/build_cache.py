@@ -18,13 +18,14 @@ import numpy as np
 import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.dataset_tools import delete_episodes, remove_feature
+from lerobot.datasets.io_utils import write_stats
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.utils.constants import ACTION, OBS_STATE
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 from tqdm import tqdm
 
 from lerobot_latentsafe._compat import drop_episode_statistics
+from lerobot_latentsafe.datasets.contract import Contract
 from lerobot_latentsafe.datasets.episodes import DatasetFrames
 from lerobot_latentsafe.datasets.frame_cache import (
     BASIS,
@@ -189,25 +190,32 @@ def build_frame_cache(
 
     Raises:
         FileExistsError: output_dir holds something else, a finished cache, or an unfinished one of something else.
+        DatasetContractError: a dataset that cannot be used as it is.
         FrameCacheError: the dataset has no camera.
     """
     output_dir, folder = Path(output_dir), Path(output_dir) / FOLDER
-    if not dataset.meta.camera_keys:
-        raise FrameCacheError(f"{dataset.repo_id} has no camera; its features are {list(dataset.meta.features)}")
     rank = int(os.environ.get("RANK", 0))
     unfinished = (folder / LAYOUT).exists() and not (folder / MANIFEST).exists()
     if rank == 0 and not unfinished:
         refuse_existing(output_dir)
+    contract = Contract.read(dataset.meta)
+    if not contract.cameras:
+        known = "".join(f"{key} is left out: {why}; " for key, why in contract.left_out.items())
+        raise FrameCacheError(
+            f"{dataset.repo_id} has no camera to cache: {known}its features are {', '.join(dataset.meta.features)}. "
+            "Record one with a camera"
+        )
     frames = DatasetFrames(dataset.meta, episodes)
+    frames.cameras = list(contract.cameras)
     see = lambda i: _episode_images(frames, frames.episodes[i], image_size)  # noqa: E731
     kept = recipe(frames.cameras, image_size)
     keep_freed_memory()
     if rank == 0 and not unfinished:
-        _lay_out(dataset, frames.episodes, output_dir, kept, see)
+        _lay_out(dataset, contract, frames.episodes, output_dir, kept, see)
     _await_layout(_layout(dataset, frames.episodes, kept), folder)
     kept.start(folder)
     copy = LeRobotDatasetMetadata(f"{dataset.repo_id}_cache", root=output_dir)
-    return _finish(dataset, copy, kept) if _fill(copy, kept, see) else None
+    return _finish(contract, copy, kept) if _fill(copy, kept, see) else None
 
 
 def _fill(copy: LeRobotDatasetMetadata, kept: Recipe, see: See) -> bool:
@@ -241,17 +249,21 @@ def _layout(dataset: LeRobotDataset, episodes: list[int], kept: Recipe) -> list:
     return json.loads(json.dumps([dataset_fingerprint(dataset.meta), kept.arrays, kept.manifest, *some]))
 
 
-def _lay_out(dataset: LeRobotDataset, episodes: list[int], output_dir: Path, kept: Recipe, see: See) -> None:
+def _lay_out(
+    dataset: LeRobotDataset, contract: Contract, episodes: list[int], output_dir: Path, kept: Recipe, see: See
+) -> None:
     """Copy the dataset without images and make room for all frames; output_dir appears when that is done."""
     begun = output_dir.with_name(f"{output_dir.name}.begun")
     shutil.rmtree(begun, ignore_errors=True)
     copy = _without_cameras(dataset, episodes, begun)
     _copy_labels(dataset, episodes, begun)
+    if not copy.meta.stats:  # lerobot-train wants some
+        write_stats(Contract.read(copy.meta).statistics, begun)
     folder, n = begun / FOLDER, copy.num_frames
     folder.mkdir()
-    columns = copy.hf_dataset.with_format("numpy")
-    np.save(folder / "state.npy", np.asarray(columns[OBS_STATE], np.float32).reshape(n, -1))
-    np.save(folder / "action.npy", np.asarray(columns[ACTION], np.float32).reshape(n, -1))
+    rows = np.isin(contract.episode, episodes)
+    np.save(folder / "state.npy", contract.state[rows])
+    np.save(folder / "action.npy", contract.action[rows])
     for name, (shape, dtype) in kept.arrays.items():
         np.lib.format.open_memmap(folder / f"{name}.npy", mode="w+", dtype=dtype, shape=(n, *shape))
     np.save(folder / DONE, np.zeros(copy.num_episodes, bool))
@@ -302,9 +314,9 @@ def _await_layout(expected: list, folder: Path, patience_s: float = 600) -> None
         )
 
 
-def _finish(dataset: LeRobotDataset, copy: LeRobotDatasetMetadata, kept: Recipe) -> FrameCache:
-    cameras = {key: list(dataset.meta.features[key]["shape"]) for key in dataset.meta.camera_keys}
-    write_manifest(Path(copy.root), copy, cameras, {**kept.manifest, "repo_id": dataset.repo_id})
+def _finish(contract: Contract, copy: LeRobotDatasetMetadata, kept: Recipe) -> FrameCache:
+    cameras = {key: [height, width, channels] for key, (channels, height, width) in contract.cameras.items()}
+    write_manifest(Path(copy.root), copy, cameras, {**kept.manifest, "repo_id": contract.repo_id})
     return FrameCache.open(copy.root, copy)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from lerobot_latentsafe.datasets.reading import DOWNLOAD_AGAIN, BrokenFileError, reading
 from lerobot_latentsafe.runtime.files import replacing
 
 FAILING, SAFE, UNLABELLED = 1, 0, -1
@@ -50,27 +51,58 @@ def read_frames(root: str | Path, columns: Iterable[str] = ()) -> dict[str, np.n
     """`index`, `episode_index` and those of `columns` that exist, of every frame in the order of the index.
 
     Raises:
-        UnlabelledDatasetError: no dataset at root.
+        BrokenFileError: no dataset at root, or a file of it that cannot be read.
     """
     files = sorted(Path(root).glob("data/*/*.parquet"))
     if not files:
-        raise UnlabelledDatasetError(f"{root} holds no data/*/*.parquet; is it a LeRobotDataset (v3) folder?")
-    present = set(pq.ParquetFile(files[0]).schema_arrow.names)
+        raise BrokenFileError(
+            f"{root} holds no data/*/*.parquet, where the frames of a LeRobotDataset (v3) lie; {DOWNLOAD_AGAIN}"
+        )
+    with reading(files[0]):
+        present = set(pq.ParquetFile(files[0]).schema_arrow.names)
     wanted = ["index", "episode_index", *sorted(set(columns) & present)]
-    table = pa.concat_tables([pq.read_table(file, columns=wanted) for file in files]).combine_chunks()
-    order = np.argsort(np.asarray(table["index"]))
-    return {name: _to_numpy(table[name].combine_chunks())[order] for name in wanted}
+    frames = [_read_columns(file, wanted) for file in files]
+    read = {name: _joined([part[name] for part in frames]) for name in wanted}
+    order = np.argsort(read["index"], kind="stable")
+    return {name: values[order] for name, values in read.items()}
 
 
-def _to_numpy(column: pa.Array) -> np.ndarray:
+def _read_columns(file: Path, names: list[str]) -> dict[str, np.ndarray]:
+    with reading(file):
+        table = pq.ParquetFile(file).read(columns=names)
+        return {name: _to_numpy(table[name]) for name in names}
+
+
+def _joined(parts: list[np.ndarray]) -> np.ndarray:
+    """Of all files; arrays of objects where they are not of one shape."""
+    if len({part.shape[1:] for part in parts}) > 1:
+        parts = [np.fromiter(part, object, len(part)) for part in parts]
+    return np.concatenate(parts)
+
+
+def _to_numpy(column: pa.Array | pa.ChunkedArray) -> np.ndarray:
     """(N,) or (N, D): lists of one length become rows, anything ragged or with holes an array of objects."""
     if isinstance(column, pa.ChunkedArray):
         column = pa.concat_arrays(column.chunks) if column.num_chunks else pa.array([], column.type)
-    if pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type):
-        values = column.flatten().to_numpy(zero_copy_only=False)
-        if len(column) and len(values) % len(column) == 0:
-            return values.reshape(len(column), -1)
-    return column.to_numpy(zero_copy_only=False)
+    values, n = _plain(column), len(column)
+    while _is_list(values.type):
+        lengths = set(values.value_lengths().to_pylist()) if not pa.types.is_fixed_size_list(values.type) else {0}
+        if len(lengths) > 1 or values.null_count:
+            return column.to_numpy(zero_copy_only=False)
+        values = _plain(values.flatten())
+    numbers = values.to_numpy(zero_copy_only=False)
+    return numbers.reshape(n, -1) if _is_list(_plain(column).type) and n else numbers
+
+
+def _plain(column: pa.Array) -> pa.Array:
+    """Without what LeRobot's and Arrow's types wrap around the values."""
+    if isinstance(column.type, pa.ExtensionType):
+        column = column.storage
+    return column.dictionary_decode() if pa.types.is_dictionary(column.type) else column
+
+
+def _is_list(kind: pa.DataType) -> bool:
+    return pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
 
 
 def identity(frames: dict[str, np.ndarray], n: int) -> str:
