@@ -39,6 +39,7 @@ class Shield:
 
     Attributes:
         pose: (B, S) in robot units, the last usable reading of each number of the state; NaN before there was one.
+        missed: (B, S), ticks since then.
         told: (B, A) in robot units, what the robots were told last.
         executed: (B, A), the same as the world model hears it.
     """
@@ -55,6 +56,7 @@ class Shield:
         """Forget the history: call at the start of every episode."""
         self.belief = Belief()
         self.pose: Tensor | None = None
+        self.missed: Tensor | None = None
         self.told: Tensor | None = None
         self.executed: Tensor | None = None
         self.decision: FilterDecision | None = None
@@ -201,7 +203,8 @@ class Shield:
         for other in _shields - {self}:
             fresh = other.decided_at is not None and 0 <= self.clock() - other.decided_at <= within_s
             if fresh and torch.equal(other.decision.action.cpu(), action) and self._accepts(other):
-                self.belief, self.pose, self.told, self.executed = other.belief, other.pose, other.told, other.executed
+                self.belief, self.pose, self.missed = other.belief, other.pose, other.missed
+                self.told, self.executed = other.told, other.executed
                 self.decision, self.decided_at = other.decision, other.decided_at
                 self.recent, self.retreated = other.recent, other.retreated
                 return True
@@ -245,9 +248,12 @@ class Shield:
             )
         fault = torch.zeros(len(state), dtype=torch.long, device=model.device)
         images = {}
-        finite, usable = torch.isfinite(state).all(-1), model.units.believable(state)
+        finite = torch.isfinite(state).all(-1)
+        if self.pose is None:
+            self.pose, self.missed = torch.full_like(state, torch.nan), torch.zeros_like(state)
+        usable = model.units.believable(state, self.pose, self.missed)
         state = torch.where(usable, state, torch.nan)
-        self.pose = torch.where(usable, state, torch.nan if self.pose is None else self.pose)
+        self.pose, self.missed = torch.where(usable, state, self.pose), (self.missed + 1) * ~usable
         for key in cameras:
             image = model.place(observation[key])
             check_proportions(key, tuple(image.shape[1:]), model.config.input_features[key].shape)
@@ -329,7 +335,7 @@ class Shield:
         units = self.model.units
         finite = (torch.isfinite(action).all(-1) & torch.isfinite(value))[:, None].expand_as(action)
         # A target that does not move stays as it was told, so that an arm does not sink, and a grip does not open.
-        finite = finite & ~(units.is_target & (units.frozen | (action == 0)))
+        finite = finite & ~(units.stays | (units.is_target & (action == 0)))
         return torch.where(finite, units.denormalise_action(action, self.pose), hold)
 
     def _hold(self, state: Tensor) -> Tensor:

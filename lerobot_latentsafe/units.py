@@ -18,6 +18,9 @@ RANGE_TOLERANCE = 0.1
 """Share of the data's range by which a command may leave it: it is clipped, and judged and executed as clipped."""
 STATE_TOLERANCE = 1.0
 """Share of the data's range by which a number of the state may leave it and still be believed."""
+STEP_TOLERANCE, MISSED_TICKS = 3.0, 3
+"""A number of the state that changes by more than so many of the data's largest steps since it was read last is not
+believed; if it could not be read meanwhile, so many ticks count at most."""
 LOUDEST = 4.0
 """Inside, a displacement of the 99th percentile is 1; the rare larger ones are heard as this at most."""
 
@@ -42,6 +45,7 @@ class TrainedOn:
         displacement_low, displacement_high: least and largest displacement of each target, its 99th percentile in
             size is displacement_scale; 0, 0 and 1 for commands that are no targets.
         state_low, state_high, state_mean, state_std: of the data.
+        state_step: by how much each number of the state changes from frame to frame at most.
     """
 
     stage: str = "untrained"
@@ -61,6 +65,7 @@ class TrainedOn:
     displacement_scale: list[float] | None = None
     state_low: list[float] | None = None
     state_high: list[float] | None = None
+    state_step: list[float] | None = None
     state_mean: list[float] | None = None
     state_std: list[float] | None = None
 
@@ -110,9 +115,11 @@ class Units(nn.Module):
     displacement_scale: Tensor
     state_low: Tensor
     state_high: Tensor
+    state_step: Tensor
     state_mean: Tensor
     state_std: Tensor
     frozen: Tensor
+    stays: Tensor
     is_target: Tensor
 
     def __init__(self, trained_on: TrainedOn, frozen_commands: list[str]):
@@ -122,7 +129,7 @@ class Units(nn.Module):
         unknown = {
             "displacement_low": [0.0] * n_actions, "displacement_high": [0.0] * n_actions,
             "displacement_scale": [1.0] * n_actions, "state_low": [-torch.inf] * n_states,
-            "state_high": [torch.inf] * n_states,
+            "state_high": [torch.inf] * n_states, "state_step": [torch.inf] * n_states,
         }  # fmt: skip
         for name in ("action_low", "action_high", "state_mean", "state_std", *unknown):
             known = getattr(trained_on, name)
@@ -134,6 +141,7 @@ class Units(nn.Module):
         self.register_buffer("is_target", torch.tensor([c.meaning == "target" for c in commands]), persistent=False)
         frozen = torch.tensor([c.name in frozen_commands or c.meaning == "other" for c in commands])
         self.register_buffer("frozen", frozen, persistent=False)
+        self.register_buffer("stays", frozen & (trained_on.meanings is not None), persistent=False)
         shown_by = [c.of_state or c.name for c in commands]
         places = [self.state_names.index(name) if name in self.state_names else -1 for name in shown_by]
         self.register_buffer("_shown_by", torch.tensor(places), persistent=False)
@@ -256,8 +264,19 @@ class Units(nn.Module):
         """Robot units -> standard deviations from the mean: (..., S)."""
         return (state.float() - self.state_mean) / self.state_std
 
-    def believable(self, state: Tensor) -> Tensor:
-        """Numbers of a state (B, S) that are finite and not absurdly far from what the data show: bool (B, S)."""
+    def believable(self, state: Tensor, pose: Tensor, missed: Tensor) -> Tensor:
+        """Numbers of a state (B, S) that a robot like that of the data can show, after what it showed before.
+
+        Args:
+            pose: (B, S), each number as it was read last; NaN before that.
+            missed: (B, S), ticks since then in which it could not be read.
+
+        Returns:
+            bool (B, S): finite, not absurdly far from the data, and not absurdly far from `pose`.
+        """
         width = self.state_high - self.state_low
-        slack = STATE_TOLERANCE * torch.maximum(width, 0.1 * width.amax()) if len(width) else width
-        return state.isfinite() & (state >= self.state_low - slack) & (state <= self.state_high + slack)
+        widest = width.amax() if len(width) else width.sum()
+        slack = STATE_TOLERANCE * torch.maximum(width, 0.1 * widest)
+        near = state.isfinite() & (state >= self.state_low - slack) & (state <= self.state_high + slack)
+        step = STEP_TOLERANCE * torch.maximum(self.state_step, 0.02 * widest)
+        return near & ~((state - pose).abs() > step * (1 + missed.clamp(max=MISSED_TICKS)))
