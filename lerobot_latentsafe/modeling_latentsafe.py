@@ -71,6 +71,7 @@ class LatentSafePolicy(PreTrainedPolicy):
         if data is not None and data.cache is not None:
             self.model.world_model.load_basis(Path(data.frame_cache))
         setattr(self, NOT_AVERAGED, self._never_averaged())
+        self._told_untrained = False
         self._base: list[BasePolicy] = []  # in a list, so that its weights are not ours
         self.shield = Shield(self.model)
         if config.base_policy_path:
@@ -99,7 +100,8 @@ class LatentSafePolicy(PreTrainedPolicy):
             )
         if self.model.device.type == "cpu":
             keep_freed_memory()
-        loss, _, metrics = self.model.clip_loss(self.reader.read(batch, self.model))
+        with self.model.single_precision():
+            loss, _, metrics = self.model.clip_loss(self.reader.read(batch, self.model))
         return loss, {name: torch.as_tensor(value).item() for name, value in metrics.items()}
 
     # -- deployment ---
@@ -113,12 +115,13 @@ class LatentSafePolicy(PreTrainedPolicy):
         """Shield a policy: an object, or that of a folder, a Hub id or a committed name.
 
         Raises:
-            ValueError: it acts in another action space, or at another rate.
+            ValueError: it acts in another action space, reads another state, or acts at another rate.
         """
         path = getattr(base.config, "pretrained_path", None) if isinstance(base, BasePolicy) else base
         if not isinstance(base, BasePolicy):
             base = BasePolicy.load(base, self.config.device, self.config.base_ahead)
         self._check_base(base, path)
+        base.speak(self.config.trained_on.action_names, self.config.trained_on.state_names)
         features = {**base.config.input_features, **self.config.input_features}
         self.config.change(input_features=features, base_policy_path=str(path or "base policy"))
         self._base = [base]
@@ -131,8 +134,8 @@ class LatentSafePolicy(PreTrainedPolicy):
                 f"base policy {path} acts in {getattr(theirs, 'shape', None)}, the filter in {own.shape} "
                 f"({', '.join(trained_on.action_names or [])}); they must share one action space"
             )
-        for name in ("task", "fps", "action_names"):  # a policy with a world model says what that is of
-            known, wanted = getattr(trained_on, name), getattr(base.config, name, None)
+        task = getattr(base.config, "task", None)  # a policy with a world model says what that is of
+        for name, known, wanted in (("task", trained_on.task, task), ("fps", trained_on.fps, base.origin.fps)):
             if known is not None and wanted is not None and known != wanted:
                 raise ValueError(f"base policy {path} has {name} = {wanted}, the filter {known}; they must agree")
 
@@ -145,14 +148,27 @@ class LatentSafePolicy(PreTrainedPolicy):
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """The shielded base action, or the fallback's action if there is no base policy: (B, A) in robot units."""
+        if self.reader is not None and not self.model.is_trained_for_law():
+            return self._stand_still(batch)
         return self.decide(batch).action
+
+    def _stand_still(self, batch: dict[str, Tensor]) -> Tensor:
+        """No motion (B, A): what lerobot-train's `--env.type` evaluates while there is no critic yet."""
+        if not self._told_untrained:
+            self._told_untrained = True
+            logger.warning(
+                "lerobot-train evaluates a filter whose safety critic is not trained yet: the robot stands still, and "
+                "the success rate says nothing. Leave out --env.type, or give --env_eval_freq=0; train the critic with "
+                "latentsafe train-reachability, then measure with latentsafe eval-shield"
+            )
+        return self.model.units.hold_action(len(batch[OBS_STATE]))
 
     @torch.no_grad()
     def decide(self, batch: dict[str, Tensor], age_s: float = 0.0) -> FilterDecision:
         """Like `select_action`, with the whole decision."""
         self.model.require_trained_for_law()
         if self.base is None:
-            return self.shield(batch, None, age_s, missing_reason=Reason.NO_BASE_POLICY)
+            return self._judge(batch, None, age_s, missing_reason=Reason.NO_BASE_POLICY)
         try:
             proposed = self.base.propose(batch)
         except Exception:
@@ -160,14 +176,28 @@ class LatentSafePolicy(PreTrainedPolicy):
                 raise
             logger.exception("base policy failed; the fallback acts")
             proposed = None
-        decision = self.shield(batch, proposed, age_s)
+        decision = self._judge(batch, proposed, age_s)
         if decision.intervened.any():
             self.base.replan(decision.action)
         return decision
 
+    @torch.compiler.disable
+    def _judge(self, *given: Any, **options: Any) -> FilterDecision:
+        """The shield's decision, in single precision under autocast and uncompiled: the same wherever it is made."""
+        with self.model.single_precision():
+            return self.shield(*given, **options)
+
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """A chunk of one: (B, 1, A). A longer one would be filtered on stale observations."""
         return self.select_action(batch).unsqueeze(1)
+
+    def supports_rtc(self) -> bool:
+        """No: a chunk is decided on one observation, and a filter must see what every action of it leads to."""
+        logger.error(
+            "a shielded policy judges one action a tick, and real-time chunking asks for whole chunks. Run the bare "
+            "policy with --inference.type=rtc on a shielded robot (--robot.type=latentsafe_shielded)"
+        )
+        return False
 
     # -- files ---
 

@@ -9,6 +9,7 @@ import time
 import weakref
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -50,6 +51,14 @@ class Shield:
         self._told_clipped = False
         self._same_weights: weakref.WeakKeyDictionary[Shield, bool] = weakref.WeakKeyDictionary()
         self.reset()
+        _shields.add(self)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """A copy, or one that was pickled, compares its weights with others' anew."""
+        return {name: value for name, value in self.__dict__.items() if name != "_same_weights"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _same_weights=weakref.WeakKeyDictionary())
         _shields.add(self)
 
     def reset(self) -> None:

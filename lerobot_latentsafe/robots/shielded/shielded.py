@@ -64,8 +64,6 @@ class LatentSafeShielded(Robot):
         self.journal = Journal(config.journal) if config.journal else None
         self._events = LeRobotEvents()
         self._sent: dict[str, float] = {}
-        self._sent_early: dict[str, float] | None = None
-        self._early = False
         self._forget()
 
     def _check_fit(self) -> None:
@@ -163,35 +161,21 @@ class LatentSafeShielded(Robot):
         Returns:
             What was executed.
         """
-        early = self._sent_early
-        self._sent_early = None
-        if early is not None and action == early:
-            return early
         shield, names = self.filter.shield, self._trained_on.action_names
         before = shield.decision
         sent = self.inner.send_action(self._decide(action))
         self._sent.update(sent)
+        self._untaken = dict(sent)
         if self.journal and shield.decision is not None and shield.decision is not before:
             self.journal.add(shield.decision, [float(sent[name]) for name in names])
         if set(sent) == set(names) and shield.executed is not None:  # the robot may have clipped it
             shield.was_executed(torch.tensor([[float(sent[name]) for name in names]], device=self.filter.model.device))
         return sent
 
-    def send_early(self, action: dict[str, float]) -> dict[str, float]:
-        """Like `send_action`; a `send_action` of the result that follows has nothing left to do.
-
-        Raises:
-            ValueError: not the robot's action names; nothing was sent.
-        """
-        if set(action) != set(self.action_features):
-            raise ValueError(
-                f"the operator commands {', '.join(action)}; {self.name} takes {', '.join(self.action_features)}. "
-                "Nothing was sent; use a teleoperator of this robot"
-            )
-        self._early, self._sent_early = True, None
-        sent = self.send_action(action)
-        self._sent_early = dict(sent)
-        return dict(sent)
+    def take_sent(self) -> dict[str, float] | None:
+        """What was executed since this was asked last, if anything: for whoever stores it."""
+        sent, self._untaken = self._untaken, None
+        return sent
 
     def _decide(self, action: dict[str, float]) -> dict[str, float]:
         """What is to be executed instead of an action, or that action itself."""
@@ -244,7 +228,7 @@ class LatentSafeShielded(Robot):
         """The action of a decision on an action."""
         if not decision.intervened.item() and torch.equal(decision.action, decision.proposed):
             return action
-        if isinstance(self._phase, int) and not self._early:
+        if isinstance(self._phase, int) and self.journal is None:
             self._say_once(
                 "LeRobot stores what was proposed, not what is executed now; `latentsafe record` stores that"
             )
@@ -321,7 +305,7 @@ class LatentSafeShielded(Robot):
         self.filter.shield.reset()
         self._observation, self._fresh, self._seen_at = None, False, 0.0
         self._phase = None
-        self._sent_early = None
+        self._untaken: dict[str, float] | None = None
         self._moved: dict[str, float] = {}
         self._decided_at = None
         self._gaps: deque[float] = deque(maxlen=RATE_DECISIONS)
