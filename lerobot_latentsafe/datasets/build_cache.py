@@ -36,8 +36,8 @@ from lerobot_latentsafe.datasets.frame_cache import (
     basis_file,
     dataset_fingerprint,
 )
-from lerobot_latentsafe.datasets.labels import FOLDER as LABELS
-from lerobot_latentsafe.datasets.labels import Sidecar, identity, read_frames, sidecar_path, specifications_of
+from lerobot_latentsafe.datasets.label_places import sidecar_path, specifications_of
+from lerobot_latentsafe.datasets.labels import Content, Sidecar
 from lerobot_latentsafe.encoders.perception import Perception, PerceptionConfig
 from lerobot_latentsafe.encoders.pictures import to_model_images
 from lerobot_latentsafe.runtime.files import refuse_existing, replacing
@@ -273,19 +273,16 @@ def _without_cameras(dataset: LeRobotDataset, episodes: list[int], folder: Path)
 
 
 def _copy_labels(dataset: LeRobotDataset, episodes: list[int], folder: Path) -> None:
-    """The label files of these episodes for the copy of a dataset."""
-    labels = Path(dataset.root) / LABELS
-    if len(episodes) == dataset.num_episodes and labels.exists():
-        shutil.copytree(labels, folder / LABELS)
-        return
-    frames, kept = (read_frames(root, ["action"]) for root in (dataset.root, folder))
-    rows, n = np.isin(frames["episode_index"], episodes), len(kept["index"])
-    for name in specifications_of(dataset.root):
-        path = sidecar_path(folder, name)
-        path.parent.mkdir(exist_ok=True)
-        whole = Sidecar.read(sidecar_path(dataset.root, name), frames)
-        part = Sidecar(whole.failure[rows], whole.by[rows], whole.at[rows], whole.names)
-        part.write(path, dataset.repo_id, identity(kept, n))
+    """The labels of these episodes for the copy of a dataset, wherever their files lie."""
+    content, kept = Content(dataset.root), Content(folder)
+    rows = np.isin(content.frames["episode_index"], episodes)
+    for name in specifications_of(dataset.root, dataset.repo_id):
+        whole = Sidecar.find(dataset.root, name, content, dataset.repo_id)
+        if whole is not None:
+            path = sidecar_path(folder, name)
+            path.parent.mkdir(exist_ok=True)
+            part = Sidecar(whole.failure[rows], whole.by[rows], whole.at[rows], whole.names)
+            part.write(path, dataset.repo_id, kept)
 
 
 def _await_layout(expected: list, folder: Path, patience_s: float = 600) -> None:

@@ -95,7 +95,7 @@ class FilterData:
             FrameCacheError: a torn cache, one of another dataset, of another image size or of tokens of more cameras.
             ValueError: no camera at all, or none of that name.
         """
-        labels = FailureLabels.load(meta.root, specification)
+        labels = FailureLabels.load(meta.root, specification, meta.repo_id)
         if len(labels.failure) != meta.total_frames:
             raise ValueError(f"{meta.root} holds {len(labels.failure)} frames on disk, {meta.total_frames} by its info")
         if frame_cache is None and (Path(meta.root) / FOLDER).exists():
