@@ -9,7 +9,7 @@ import importlib
 import json
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -45,8 +45,12 @@ class Episode:
             )
         return self.frames.columns(self.number, [name])[name]
 
+    def stream(self, camera: str, numbers: Sequence[int] | None = None) -> Iterator[np.ndarray]:
+        """Frames one after the other, uint8 (H, W, 3), RGB: those of these numbers, ascending from 0, or all."""
+        return self.frames.stream(camera, self.number, numbers)
+
     def images(self, camera: str) -> np.ndarray:
-        """uint8 (T, H, W, 3), RGB."""
+        """All frames at once, uint8 (T, H, W, 3), RGB; a long episode takes much memory, which `stream` does not."""
         return self.frames.images(camera, self.number)
 
 
@@ -109,7 +113,7 @@ class VisionLanguageLabeller:
             shown=len(numbers), length=episode.length, camera=camera, task=episode.task,
             numbers=", ".join(map(str, numbers)), failure=self.failure,
         )  # fmt: skip
-        return parse_answer(self.model(prompt, list(episode.images(camera)[numbers])), episode.length)
+        return parse_answer(self.model(prompt, list(episode.stream(camera, numbers.tolist()))), episode.length)
 
 
 def parse_answer(answer: str, length: int) -> int | None:
