@@ -103,7 +103,7 @@ class FilterData:
             ValueError: no camera at all, or none of that name.
         """
         contract = Contract.read(meta)
-        labels = FailureLabels.load(meta.root, specification)
+        labels = FailureLabels.load(meta.root, specification, meta.repo_id)
         if frame_cache is None and (Path(meta.root) / FOLDER).exists():
             frame_cache = str(meta.root)
         cache, shapes = None, contract.cameras

@@ -1,5 +1,7 @@
 """What `latentsafe record` stored under a filter, read back as episodes that a report can show."""
 
+from collections.abc import Iterator, Sequence
+
 import numpy as np
 import torch
 
@@ -10,6 +12,22 @@ from lerobot_latentsafe.evaluation.along_episodes import check_fit, encode_episo
 from lerobot_latentsafe.evaluation.rollouts import Episodes
 from lerobot_latentsafe.latent import map_latent
 from lerobot_latentsafe.safety_model import SafetyModel
+
+
+class Pictures(Sequence):
+    """One camera's frames of an episode, decoded whenever somebody looks at them."""
+
+    def __init__(self, frames: DatasetFrames, camera: str, episode: int):
+        self.frames, self.camera, self.episode = frames, camera, episode
+
+    def __len__(self) -> int:
+        return self.frames.length(self.episode)
+
+    def __getitem__(self, t: int) -> np.ndarray:
+        return next(self.frames.stream(self.camera, self.episode, [range(len(self))[t]]))
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        return self.frames.stream(self.camera, self.episode)
 
 
 class RecordedEpisodes:
@@ -50,6 +68,6 @@ class RecordedEpisodes:
             success=no, violation=no, steps=np.array([length]), overridden=np.array([sum(trace["intervened"])]),
             action_change=np.array([change.sum()]), severity=np.full(1, np.nan),
             traces=[{**trace, "action": self.executed[rows].tolist()}],
-            frames=[list(self.frames.images(self.model.config.trained_on.cameras[0], episode))],
+            frames=[Pictures(self.frames, self.model.config.trained_on.cameras[0], episode)],
             latents=[[map_latent(latents, lambda z, t=t: z[:, t]) for t in range(length)]],
         )  # fmt: skip
