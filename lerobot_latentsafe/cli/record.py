@@ -10,7 +10,7 @@ from lerobot.scripts.lerobot_teleoperate import TeleoperateConfig, teleoperate
 from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME
 
 from lerobot_latentsafe.cli.options import DatasetSource, NewDataset
-from lerobot_latentsafe.collection import dubins, franka
+from lerobot_latentsafe.collection import dubins, franka, so101
 from lerobot_latentsafe.collection.sent_actions import storing_what_was_sent
 from lerobot_latentsafe.datasets.columns import write_decisions
 from lerobot_latentsafe.datasets.decisions import FILE, check_recording
@@ -47,6 +47,11 @@ class Collect:
     - bag_middle, bag_strong, bag_weak: demonstrations; in the last two the hand is pushed aside now and then
     - blocks_demos, blocks_random: the blocks
 
+    Sources of the SO-101, which pushes a cube to a mark near the table's edge:
+
+    - so101_careful, so101_reckless: demonstrations, to the mark, or 5.5 cm past it
+    - so101_mix: both, undisturbed and held now and then, with pushes by fits and starts and random motion
+
     If a recording of the Franka was killed, start it again: it goes on.
     """
 
@@ -64,8 +69,10 @@ class Collect:
             collect = partial(franka.collect_franka, workers=self.workers)
         elif self.source in dubins.SOURCES:
             collect = dubins.collect_dubins
+        elif self.source in so101.SOURCES:
+            collect = so101.collect_so101
         else:
-            known = ", ".join([*dubins.SOURCES, *franka.SOURCES])
+            known = ", ".join([*dubins.SOURCES, *franka.SOURCES, *so101.SOURCES])
             raise ValueError(f"--source is {self.source!r}; expected one of {known}")
         new = self.dataset
         dataset = collect(self.source, new.repo_id, new.folder, new.num_episodes, self.seed)
