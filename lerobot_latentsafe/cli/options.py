@@ -58,8 +58,8 @@ class DatasetSource:
             cameras, left_out = contract.cameras, contract.left_out
         if left_out and not cameras:
             raise ValueError(
-                f"{meta.repo_id} has no pictures to look at: {', '.join(left_out)} are depth maps; record a camera that "
-                "shows colours or grey"
+                f"{meta.repo_id} has no pictures to look at: {', '.join(left_out)} are depth maps; record a "
+                "camera that shows colours or grey"
             )
         frames = DatasetFrames(meta, self.episodes)
         frames.cameras = list(cameras)
@@ -67,10 +67,14 @@ class DatasetSource:
 
     def contract(self) -> tuple[LeRobotDatasetMetadata, Contract]:
         """Metadata of the dataset, and what it says of its robot."""
-        folder = self._folder()
-        meta = self._fetched() if folder is None else load_metadata(self._id, folder)
+        meta = self.found()
         self._require_known_episodes(meta)
         return meta, Contract.read(meta)
+
+    def found(self) -> LeRobotDatasetMetadata:
+        """Metadata of the dataset, whose numbers and names are not checked."""
+        folder = self._folder()
+        return self._fetched() if folder is None else load_metadata(self._id, folder)
 
     @property
     def _id(self) -> str:

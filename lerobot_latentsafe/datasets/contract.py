@@ -72,15 +72,20 @@ class Contract:
         episode = frames["episode_index"].astype(np.int64)
         check_episodes(meta, frames["index"], episode)
         cameras, left_out = settled_cameras(meta)
-        apart = _seconds_apart(meta, frames, [key for key in cameras if key in meta.video_keys])
-        check_videos(meta, [key for key in cameras if key in meta.video_keys])
+        videos = [key for key in cameras if key in meta.video_keys]
+        check_videos(meta, videos)
+        apart = _seconds_apart(meta, frames, videos)
         state, action = (_numbers(meta, frames, key) for key in (STATE, ACTION))
-        names = settled_names(*(_names(meta, key) for key in (STATE, ACTION)), state.shape[1], action.shape[1])
-        _check_finite(meta, episode, {STATE: (state, names[0]), ACTION: (action, names[1])})
+        state_names, action_names = settled_names(
+            _names(meta, STATE), _names(meta, ACTION), state.shape[1], action.shape[1]
+        )
+        _check_finite(meta, episode, {STATE: (state, state_names), ACTION: (action, action_names)})
         for key, why in left_out.items():
             _say_once(f"{meta.repo_id}: {key} is left out: {why}")
-        root, robot = Path(meta.root), meta.info.robot_type
-        return cls(meta.repo_id, root, robot, meta.fps, *names, cameras, left_out, episode, state, action, apart)
+        return cls(
+            meta.repo_id, Path(meta.root), meta.info.robot_type, meta.fps, state_names, action_names, cameras, left_out,
+            episode, state, action, apart,
+        )  # fmt: skip
 
     @property
     def statistics(self) -> dict[str, dict[str, np.ndarray]]:
@@ -177,8 +182,8 @@ def _seconds_apart(meta: "LeRobotDatasetMetadata", frames: dict[str, np.ndarray]
             raise DatasetContractError(
                 f"the timestamp of frame {frames['frame_index'][at]} of episode {frames['episode_index'][at]} of "
                 f"{meta.repo_id} is {apart * fps:.2f} frames from its place at {fps:g} Hz, so that its picture would "
-                f"be another's; expected frame_index / fps, and at most {MOST_APART} frames off. Correct fps in {INFO} or "
-                "the column timestamp in data/, or convert the dataset again"
+                f"be another's; expected frame_index / fps, and at most {MOST_APART} frames off. Correct fps in {INFO} "
+                "or the column timestamp in data/, or convert the dataset again"
             )
     for key in videos:
         begin = np.asarray(meta.episodes[f"videos/{key}/from_timestamp"], float) * fps

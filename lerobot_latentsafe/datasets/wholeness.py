@@ -43,10 +43,21 @@ def check_episodes(meta: "LeRobotDatasetMetadata", index: np.ndarray, episode: n
             f"{meta.root / 'data'} holds {found.get(e, 0)} frames of episode {e}, expected {lengths.get(e, 0)}; "
             f"episodes that do not fit: {some(torn)}. Please {WITHOUT_THEM}"
         )
-    if len(index) != meta.total_frames or not np.array_equal(index, np.arange(len(index))):
+    if len(index) != meta.total_frames:
         raise DatasetContractError(
-            f"the column index of {meta.root / 'data'} must count the frames from 0 to {meta.total_frames - 1}, each "
-            f"once; it has {len(index)} from {index[0]} to {index[-1]}. Please {DOWNLOAD_AGAIN}"
+            f"{meta.root} holds {len(index)} frames on disk, {meta.total_frames} by its {INFO}; {DOWNLOAD_AGAIN}"
+        )
+    if not np.array_equal(index, np.arange(len(index))) or (np.diff(episode) < 0).any():
+        raise DatasetContractError(
+            f"the columns index and episode_index of {meta.root / 'data'} must count up from 0, each index once; "
+            f"{DOWNLOAD_AGAIN}, or convert it again"
+        )
+    first = np.searchsorted(episode, listed)
+    moved = listed[first != np.asarray(meta.episodes["dataset_from_index"])].tolist()
+    if moved:
+        raise DatasetContractError(
+            f"{meta.root / EPISODES} says that episodes {some(moved)} begin elsewhere than in data/; {DOWNLOAD_AGAIN}, "
+            "or convert it again"
         )
 
 
