@@ -13,8 +13,8 @@ from lerobot_latentsafe.datasets.cameras import settled_cameras
 from lerobot_latentsafe.datasets.contract import Contract
 from lerobot_latentsafe.datasets.episodes import DatasetFrames
 from lerobot_latentsafe.datasets.folder import load_metadata
+from lerobot_latentsafe.datasets.layout import INFO
 from lerobot_latentsafe.datasets.reading import DatasetContractError, reading
-from lerobot_latentsafe.datasets.wholeness import INFO
 
 
 @dataclass
@@ -78,7 +78,9 @@ class DatasetSource:
 
     @property
     def _id(self) -> str:
-        return self.repo_id or DatasetSource.repo_id
+        if self.repo_id not in (None, DatasetSource.repo_id):
+            return self.repo_id
+        return f"local/{Path(self.root).name}" if self.root else DatasetSource.repo_id
 
     def _folder(self) -> Path | None:
         """Where the dataset lies on this machine; None: it must be fetched."""

@@ -14,10 +14,11 @@ import numpy as np
 
 from lerobot_latentsafe.datasets.cameras import settled_cameras
 from lerobot_latentsafe.datasets.labels import read_frames
+from lerobot_latentsafe.datasets.layout import INFO
 from lerobot_latentsafe.datasets.names import settled_names
 from lerobot_latentsafe.datasets.reading import DatasetContractError
 from lerobot_latentsafe.datasets.renaming import rename_command, renames_of
-from lerobot_latentsafe.datasets.wholeness import INFO, check_episodes, check_videos, some
+from lerobot_latentsafe.datasets.wholeness import check_episodes, check_videos, some
 
 if TYPE_CHECKING:  # the package imports this module, and LeRobot's datasets are heavy
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
@@ -164,9 +165,10 @@ def _check_finite(
             affected = np.unique(episode[row]).tolist()
             first = f"{names[column[0]]} is {values[row[0], column[0]]} in frame {row[0] - begins[row[0]]}"
             raise DatasetContractError(
-                f"{key} of {meta.repo_id} is not finite in {len(np.unique(row))} frames of episodes {some(affected)}: "
-                f"{first} of episode {episode[row[0]]}. Delete those episodes: lerobot-edit-dataset "
-                f"--repo_id={meta.repo_id} --root={meta.root} --operation.type=delete_episodes "
+                f"{key} of {meta.repo_id} is not finite in {len(np.unique(row))} of {len(values)} frames, in episodes "
+                f"{some(affected)}: {first} of episode {episode[row[0]]}. Make a copy without those episodes: "
+                f"lerobot-edit-dataset --repo_id={meta.repo_id} --root={meta.root} --new_repo_id={meta.repo_id}_whole "
+                f"--new_root={meta.root}_whole --operation.type=delete_episodes "
                 f"--operation.episode_indices='{affected}'"
             )
 

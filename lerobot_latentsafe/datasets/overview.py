@@ -8,7 +8,6 @@ from lerobot.datasets.video_utils import decode_video_frames
 
 from lerobot_latentsafe.datasets.cameras import stored_picture
 from lerobot_latentsafe.datasets.contract import ACTION, STATE, Contract
-from lerobot_latentsafe.datasets.folder import STATISTICS
 from lerobot_latentsafe.datasets.frame_cache import FOLDER, FrameCache
 from lerobot_latentsafe.datasets.labels import (
     FAILING,
@@ -22,9 +21,9 @@ from lerobot_latentsafe.datasets.labels import (
     sidecar_path,
     specifications_of,
 )
+from lerobot_latentsafe.datasets.layout import INFO, STATISTICS
 from lerobot_latentsafe.datasets.names import usable_names
 from lerobot_latentsafe.datasets.reading import DatasetContractError, reading
-from lerobot_latentsafe.datasets.wholeness import INFO
 
 ON_TIME = 1e-4
 """Seconds by which LeRobot lets a picture's time differ from a frame's, if it is not told otherwise."""

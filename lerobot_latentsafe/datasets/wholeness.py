@@ -7,15 +7,11 @@ from typing import TYPE_CHECKING
 import av
 import numpy as np
 
+from lerobot_latentsafe.datasets.layout import EPISODES, INFO
 from lerobot_latentsafe.datasets.reading import DOWNLOAD_AGAIN, BrokenFileError, DatasetContractError, reading
 
 if TYPE_CHECKING:  # the package imports this module, and LeRobot's datasets are heavy
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-
-INFO, EPISODES = "meta/info.json", "meta/episodes"
-WITHOUT_THEM = (
-    f"{DOWNLOAD_AGAIN}, or make a copy without them with lerobot-edit-dataset --operation.type=delete_episodes"
-)
 
 
 def check_episodes(meta: "LeRobotDatasetMetadata", index: np.ndarray, episode: np.ndarray) -> None:
@@ -32,7 +28,7 @@ def check_episodes(meta: "LeRobotDatasetMetadata", index: np.ndarray, episode: n
     if unlisted or len(listed) != meta.total_episodes:
         raise DatasetContractError(
             f"{meta.root / EPISODES} lists {len(listed)} episodes, {INFO} counts {meta.total_episodes}: "
-            f"{some(unlisted) or 'some'} are missing; {WITHOUT_THEM}"
+            f"{some(unlisted) or 'some'} are missing; {DOWNLOAD_AGAIN}"
         )
     lengths = dict(zip(listed.tolist(), meta.episodes["length"]))
     found = dict(zip(*(values.tolist() for values in np.unique(episode, return_counts=True))))
@@ -41,7 +37,7 @@ def check_episodes(meta: "LeRobotDatasetMetadata", index: np.ndarray, episode: n
         e = torn[0]
         raise DatasetContractError(
             f"{meta.root / 'data'} holds {found.get(e, 0)} frames of episode {e}, expected {lengths.get(e, 0)}; "
-            f"episodes that do not fit: {some(torn)}. Please {WITHOUT_THEM}"
+            f"episodes that do not fit: {some(torn)}. Please {DOWNLOAD_AGAIN}"
         )
     if len(index) != meta.total_frames:
         raise DatasetContractError(
