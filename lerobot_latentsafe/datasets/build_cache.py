@@ -38,7 +38,14 @@ from lerobot_latentsafe.datasets.frame_cache import (
     dataset_fingerprint,
 )
 from lerobot_latentsafe.datasets.labels import FOLDER as LABELS
-from lerobot_latentsafe.datasets.labels import Sidecar, identity, read_frames, sidecar_path, specifications_of
+from lerobot_latentsafe.datasets.labels import (
+    Sidecar,
+    all_labels,
+    identity,
+    read_frames,
+    sidecar_path,
+    specifications_of,
+)
 from lerobot_latentsafe.encoders.perception import Perception, PerceptionConfig
 from lerobot_latentsafe.encoders.pictures import to_model_images
 from lerobot_latentsafe.runtime.files import refuse_existing, replacing
@@ -191,7 +198,8 @@ def build_frame_cache(
     Raises:
         FileExistsError: output_dir holds something else, a finished cache, or an unfinished one of something else.
         DatasetContractError: a dataset that cannot be used as it is.
-        FrameCacheError: the dataset has no camera.
+        LabelFileError: its labels are none.
+        FrameCacheError: it has no camera.
     """
     output_dir, folder = Path(output_dir), Path(output_dir) / FOLDER
     rank = int(os.environ.get("RANK", 0))
@@ -205,6 +213,7 @@ def build_frame_cache(
             f"{dataset.repo_id} has no camera to cache: {known}its features are {', '.join(dataset.meta.features)}. "
             "Record one with a camera"
         )
+    all_labels(dataset.root, dataset.meta.features)  # refuses what training would refuse
     frames = DatasetFrames(dataset.meta, episodes)
     frames.cameras = list(contract.cameras)
     see = lambda i: _episode_images(frames, frames.episodes[i], image_size)  # noqa: E731

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lerobot_latentsafe.datasets.cameras import settled_cameras
+from lerobot_latentsafe.datasets.cameras import settled_cameras, stored_picture
 from lerobot_latentsafe.datasets.labels import read_frames
 from lerobot_latentsafe.datasets.layout import INFO
 from lerobot_latentsafe.datasets.names import settled_names
-from lerobot_latentsafe.datasets.reading import DatasetContractError
+from lerobot_latentsafe.datasets.reading import DatasetContractError, some
 from lerobot_latentsafe.datasets.renaming import rename_command, renames_of
-from lerobot_latentsafe.datasets.wholeness import check_episodes, check_videos, some
+from lerobot_latentsafe.datasets.wholeness import check_order, check_videos, require_size
 
 if TYPE_CHECKING:  # the package imports this module, and LeRobot's datasets are heavy
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
@@ -71,11 +71,13 @@ class Contract:
         check_features(meta)
         frames = read_frames(meta.root, [ACTION, STATE, "timestamp", "frame_index"])
         episode = frames["episode_index"].astype(np.int64)
-        check_episodes(meta, frames["index"], episode)
+        check_order(meta, frames["index"], episode)
         cameras, left_out = settled_cameras(meta)
-        videos = [key for key in cameras if key in meta.video_keys]
+        videos = {key: shape for key, shape in cameras.items() if key in meta.video_keys}
         check_videos(meta, videos)
-        apart = _seconds_apart(meta, frames, videos)
+        for key in {*cameras} - {*videos}:
+            require_size(key, stored_picture(meta, key).size[::-1], cameras[key][1:])
+        apart = _seconds_apart(meta, frames, list(videos))
         state, action = (_numbers(meta, frames, key) for key in (STATE, ACTION))
         state_names, action_names = settled_names(
             _names(meta, STATE), _names(meta, ACTION), state.shape[1], action.shape[1]

@@ -274,6 +274,29 @@ class FailureLabels:
         return float((self.failure == FAILING).sum() / (self.failure != UNLABELLED).sum())
 
 
+def all_labels(root: str | Path, features: dict[str, dict]) -> dict[str, np.ndarray]:
+    """The labels of all specifications that a dataset has, name -> int8 (N,).
+
+    Args:
+        features: of the dataset. `failure` must hold labels; others do if their name is fit and all values are labels.
+
+    Raises:
+        LabelFileError: a label file of another dataset, or values that are no labels.
+    """
+    numbers = [name for name, f in features.items() if f["dtype"].startswith(("bool", "int", "uint", "float"))]
+    frames = read_frames(root, ["action", *(name for name in ["failure", *numbers] if NAME.fullmatch(name))])
+    n, found = len(frames["index"]), {}
+    for name in sorted(set(frames) - {"index", "episode_index", "action"}):
+        try:
+            found[name] = as_labels(frames[name], n, f"column {name!r} of {root}")
+        except LabelFileError:
+            if name == "failure":
+                raise
+    for name in specifications_of(root):
+        found[name] = Sidecar.read(sidecar_path(root, name), frames).failure
+    return found
+
+
 def as_labels(values: np.ndarray, n: int, source: str) -> np.ndarray:
     """Exactly -1, 0 or 1 for each of n frames: what is cast to int8 unchecked could turn into "safe"."""
     if values.shape == (n, 1):

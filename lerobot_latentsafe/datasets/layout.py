@@ -5,12 +5,14 @@ find for something to fetch from the Hub.
 """
 
 import json
+from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import pyarrow.parquet as pq
 
-from lerobot_latentsafe.datasets.reading import DOWNLOAD_AGAIN, BrokenFileError, DatasetContractError, reading
+from lerobot_latentsafe.datasets.reading import DOWNLOAD_AGAIN, BrokenFileError, DatasetContractError, reading, some
 
 INFO, STATISTICS, TASKS, EPISODES = "meta/info.json", "meta/stats.json", "meta/tasks.parquet", "meta/episodes"
 CONVERTER = "python -m lerobot.scripts.convert_dataset_v21_to_v30"
@@ -26,18 +28,11 @@ def check_layout(root: Path) -> dict[str, Any]:
     info = _read_info(root)
     if info.get("total_tasks") and not (root / TASKS).exists():
         raise BrokenFileError(f"{root / TASKS} is missing, which lists the tasks; {DOWNLOAD_AGAIN}")
-    _rows(root, root.glob(TASKS))
-    episodes, frames = (_rows(root, root.glob(f"{folder}/*/*.parquet")) for folder in (EPISODES, "data"))
-    for folder, found, what in ((EPISODES, episodes, "total_episodes"), ("data", frames, "total_frames")):
-        if found != info[what]:
-            raise BrokenFileError(
-                f"{root / folder} holds {found} rows, {info[what]} by {what} of {INFO}: files are missing, or are of "
-                f"another recording; {DOWNLOAD_AGAIN}"
-            )
+    for table in ([TASKS], [EPISODES, "*/*.parquet"], ["data", "*/*.parquet"]):
+        _check_readable(root.glob("/".join(table)))
+    _check_episodes(root, info["total_episodes"])
     if (root / STATISTICS).exists():
-        with reading(
-            root / STATISTICS, "delete it: lerobot-edit-dataset --operation.type=recompute_stats makes another"
-        ):
+        with reading(root / STATISTICS, "delete it; lerobot-edit-dataset --operation.type=recompute_stats makes one"):
             json.loads((root / STATISTICS).read_text())
     return info
 
@@ -71,13 +66,42 @@ def _read_info(root: Path) -> dict[str, Any]:
     return info
 
 
-def _rows(root: Path, files: Any) -> int:
-    """Rows of parquet files together; only their ends are read."""
-    rows = 0
+def _check_readable(files: Iterable[Path]) -> None:
+    """Refuse a parquet file without its end, which is what is missing of one that was cut off."""
     for file in files:
         with reading(file):
-            rows += pq.read_metadata(file).num_rows
-    return rows
+            pq.read_metadata(file)
+
+
+def _check_episodes(root: Path, n: int) -> None:
+    """Refuse a dataset that lacks an episode, or frames of one."""
+    listed = _columns(root, EPISODES, ["episode_index", "length"])
+    found = Counter(_columns(root, "data", ["episode_index"])["episode_index"])
+    lengths = dict(zip(listed["episode_index"], listed["length"]))
+    unlisted = sorted({*range(n)} - {*lengths})
+    if unlisted or len(listed["length"]) != n:
+        raise BrokenFileError(
+            f"{root / EPISODES} lists {len(listed['length'])} episodes, {n} by total_episodes of {INFO}: "
+            f"{some(unlisted) or 'none'} missing; {DOWNLOAD_AGAIN}"
+        )
+    torn = [e for e in sorted({*lengths} | {*found}) if lengths.get(e, 0) != found[e]]
+    if torn:
+        e = torn[0]
+        raise BrokenFileError(
+            f"{root / 'data'} holds {found[e]} frames of episode {e}, {lengths.get(e, 0)} by {EPISODES}; episodes that "
+            f"do not fit: {some(torn)}. Please {DOWNLOAD_AGAIN}"
+        )
+
+
+def _columns(root: Path, folder: str, names: list[str]) -> dict[str, list]:
+    """Columns of all files of a folder."""
+    columns: dict[str, list] = {name: [] for name in names}
+    for file in sorted(root.glob(f"{folder}/*/*.parquet")):
+        with reading(file):
+            table = pq.ParquetFile(file).read(columns=names)
+            for name in names:
+                columns[name] += table[name].to_pylist()
+    return columns
 
 
 def check_for_lerobot(root: Path, imagenet_statistics: bool) -> None:
@@ -93,8 +117,8 @@ def check_for_lerobot(root: Path, imagenet_statistics: bool) -> None:
     cameras = [key for key, feature in info["features"].items() if feature["dtype"] in ("image", "video")]
     if cameras and imagenet_statistics and not (root / STATISTICS).exists():
         raise DatasetContractError(
-            f"{root / STATISTICS} is missing, which lerobot-train writes to. Give --dataset.use_imagenet_stats=false, as "
-            "a filter needs no statistics of pictures; or run latentsafe cache and train on that"
+            f"{root / STATISTICS} is missing, which lerobot-train writes to. Give --dataset.use_imagenet_stats=false, "
+            "as a filter needs no statistics of pictures; or run latentsafe cache and train on that"
         )
     for key in cameras:
         if len(info["features"][key].get("names") or []) != 3:

@@ -9,21 +9,10 @@ from lerobot.datasets.video_utils import decode_video_frames
 from lerobot_latentsafe.datasets.cameras import stored_picture
 from lerobot_latentsafe.datasets.contract import ACTION, STATE, Contract
 from lerobot_latentsafe.datasets.frame_cache import FOLDER, FrameCache
-from lerobot_latentsafe.datasets.labels import (
-    FAILING,
-    NAME,
-    SAFE,
-    UNLABELLED,
-    LabelFileError,
-    Sidecar,
-    as_labels,
-    read_frames,
-    sidecar_path,
-    specifications_of,
-)
+from lerobot_latentsafe.datasets.labels import FAILING, SAFE, UNLABELLED, all_labels
 from lerobot_latentsafe.datasets.layout import INFO, STATISTICS
 from lerobot_latentsafe.datasets.names import usable_names
-from lerobot_latentsafe.datasets.reading import DatasetContractError, reading
+from lerobot_latentsafe.datasets.reading import reading
 
 ON_TIME = 1e-4
 """Seconds by which LeRobot lets a picture's time differ from a frame's, if it is not told otherwise."""
@@ -81,50 +70,28 @@ def label_rows(meta: LeRobotDatasetMetadata) -> list[Row]:
     Raises:
         LabelFileError: labels of another dataset, or values that are none.
     """
-    columns = [key for key, feature in meta.features.items() if NAME.fullmatch(key) and _is_count(feature)]
-    frames = read_frames(meta.root, [ACTION, *columns])
-    n, found = len(frames["index"]), {}
-    for name in columns:
-        try:
-            found[name] = as_labels(frames[name], n, f"column {name!r} of {meta.root}")
-        except LabelFileError:
-            if name == "failure":  # others need not be labels
-                raise
-    for name in specifications_of(meta.root):
-        found[name] = Sidecar.read(sidecar_path(meta.root, name), frames).failure
     kinds = (("failing", FAILING), ("safe", SAFE), ("not labelled", UNLABELLED))
     return [
         ("labels", f"{name}: {', '.join(f'{(labels == value).sum()} {kind}' for kind, value in kinds)}")
-        for name, labels in found.items()
+        for name, labels in all_labels(meta.root, meta.features).items()
     ]
 
 
-def _is_count(feature: dict) -> bool:
-    return tuple(feature["shape"]) == (1,) and feature["dtype"] not in ("string", "video", "image")
-
-
 def check_first_pictures(meta: LeRobotDatasetMetadata, contract: Contract) -> None:
-    """Decode the first picture of each camera, and compare its shape with what the dataset says.
+    """Decode the first picture of each camera.
 
     Raises:
-        DatasetContractError: naming the camera and both shapes.
+        BrokenFileError: naming the file.
     """
-    for key, (_, height, width) in contract.cameras.items():
-        if key in meta.video_keys:
-            path = meta.root / meta.get_video_file_path(0, key)
-            begin = float(meta.episodes[0][f"videos/{key}/from_timestamp"])
-            with reading(path):
-                seen = decode_video_frames(path, [begin], 0.5 / meta.fps, backend="pyav").shape[-2:]
-        else:
+    for key in contract.cameras:
+        if key not in meta.video_keys:
             with reading(meta.root / meta.get_data_file_path(0)):
-                picture = stored_picture(meta, key)
-                picture.load()
-                seen = picture.size[::-1]
-        if tuple(seen) != (height, width):
-            raise DatasetContractError(
-                f"the pictures of {key} have {seen[0]} x {seen[1]} pixels, {height} x {width} by {meta.root / INFO}; "
-                "correct the shape there"
-            )
+                stored_picture(meta, key).load()
+            continue
+        path = meta.root / meta.get_video_file_path(0, key)
+        with reading(path):
+            begin = float(meta.episodes[0][f"videos/{key}/from_timestamp"])
+            decode_video_frames(path, [begin], 0.5 / meta.fps, backend="pyav")
 
 
 def advice(meta: LeRobotDatasetMetadata, contract: Contract) -> Iterator[str]:
