@@ -12,9 +12,9 @@ from lerobot.utils.constants import HF_LEROBOT_HOME
 from lerobot_latentsafe.datasets.cameras import settled_cameras
 from lerobot_latentsafe.datasets.contract import Contract
 from lerobot_latentsafe.datasets.episodes import DatasetFrames
-from lerobot_latentsafe.datasets.folder import load_metadata
+from lerobot_latentsafe.datasets.folder import load_metadata, open_dataset
 from lerobot_latentsafe.datasets.layout import INFO
-from lerobot_latentsafe.datasets.reading import DatasetContractError, reading
+from lerobot_latentsafe.datasets.reading import DatasetContractError
 
 
 @dataclass
@@ -40,8 +40,7 @@ class DatasetSource:
     def opened(self) -> LeRobotDataset:
         """The whole dataset, after the same checks."""
         meta = self.metadata()
-        with reading(Path(meta.root)):
-            return LeRobotDataset(meta.repo_id, root=meta.root)
+        return open_dataset(meta.repo_id, meta.root)
 
     def frames(self) -> DatasetFrames:
         """The dataset's pictures, after the same checks.

@@ -99,11 +99,18 @@ def _model_inputs(model: SafetyModel, frames: DatasetFrames, episode: int) -> tu
         key: model.images(torch.from_numpy(frames.images(key, episode)).permute(0, 3, 1, 2).contiguous())
         for key in model.world_model.image_keys
     }
-    columns = frames.columns(episode, ["observation.state", "action"])
-    state, action = (torch.from_numpy(c).float().reshape(len(c), -1).to(model.device) for c in columns.values())
+    state, action = (numbers_of(frames, episode, key).to(model.device) for key in ("observation.state", "action"))
     units = model.units
     return (
         model.world_model.perceive(images),
         units.normalise_state(state),
         units.normalise_action(action).clamp(-1, 1),
     )
+
+
+def numbers_of(frames: DatasetFrames, episode: int, key: str) -> Tensor:
+    """The numbers of a feature in an episode: (T, D), or (T, 0) of a dataset without it."""
+    if key not in frames.meta.features:
+        return torch.zeros(frames.meta.episodes[episode]["length"], 0)
+    values = torch.from_numpy(frames.columns(episode, [key])[key]).float()
+    return values.reshape(len(values), -1)

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from lerobot_latentsafe.datasets.episodes import DatasetFrames
-from lerobot_latentsafe.evaluation.along_episodes import check_fit
+from lerobot_latentsafe.evaluation.along_episodes import check_fit, numbers_of
 from lerobot_latentsafe.latent import Latent
 from lerobot_latentsafe.safety_model import SafetyModel
 
@@ -48,7 +48,7 @@ class NearestFrames:
         places = np.unique(np.linspace(0, total - 1, min(EPISODES, total)).round().astype(int))
         for episode in np.array(frames.episodes)[places].tolist():
             images = {key: frames.images(key, episode)[::step] for key in self.model.world_model.image_keys}
-            state = torch.from_numpy(frames.columns(episode, ["observation.state"])["observation.state"][::step])
+            state = numbers_of(frames, episode, "observation.state")[::step]
             tensors = {key: torch.from_numpy(i).permute(0, 3, 1, 2).contiguous() for key, i in images.items()}
             self.add(list(images[self.model.config.trained_on.cameras[0]]), tensors, state)
 
