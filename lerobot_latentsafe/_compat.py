@@ -37,12 +37,12 @@ def quiet_decoder() -> None:
 
 
 def training_run() -> "TrainPipelineConfig | None":
-    """The options of the lerobot-train that is making a policy just now, if any: LeRobot hands them to no policy."""
+    """The options of the lerobot-train that is at work just now, if any: LeRobot hands them to no policy."""
     frame = sys._getframe(1)
     while frame is not None:
-        options = frame.f_locals.get("cfg")
-        if type(options).__name__ == "TrainPipelineConfig":
-            return options
+        for options in (frame.f_locals.get("cfg"), frame.f_locals.get("self")):
+            if type(options).__name__ == "TrainPipelineConfig":
+                return options
         frame = frame.f_back
     return None
 

@@ -32,12 +32,13 @@ class Verb:
 
 GROUPS = {
     "record": "record episodes",
+    "dataset": "see whether they can be used",
     "label": "say where episodes fail",
     "train": "make a filter of them",
     "deploy": "use it",
     "evaluate": "ask what it is worth",
 }
-_RECORD, _LABEL, _TRAIN, _DEPLOY, _EVALUATE = (f"lerobot_latentsafe.cli.{group}" for group in GROUPS)
+_RECORD, _DATASET, _LABEL, _TRAIN, _DEPLOY, _EVALUATE = (f"lerobot_latentsafe.cli.{group}" for group in GROUPS)
 _DREAMER = "lerobot_latentsafe.experiments.blocks.dreamer_training"
 
 VERBS: dict[str, Verb] = {
@@ -46,6 +47,15 @@ VERBS: dict[str, Verb] = {
     "teleoperate": Verb("record", _RECORD, "Teleoperate", "lerobot-teleoperate under a filter"),
     "merge-decisions": Verb(
         "record", _RECORD, "MergeDecisions", "copy a recording with the shield's decisions as columns"
+    ),
+    "check-dataset": Verb(
+        "dataset",
+        _DATASET,
+        "CheckDataset",
+        "print what a dataset says of its robot, and whether a filter can be made of it",
+    ),
+    "rename-features": Verb(
+        "dataset", _DATASET, "RenameFeatures", "copy a dataset with the names of features that LeRobot expects"
     ),
     "label": Verb("label", _LABEL, "Label", "open a local page on which a person marks where episodes fail"),
     "auto-label": Verb("label", _LABEL, "AutoLabel", "let a function or a vision-language model label the rest"),

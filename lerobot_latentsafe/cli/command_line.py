@@ -180,8 +180,9 @@ def _is_explained(error: Exception) -> bool:
     while last is not None and last.tb_next is not None:
         last = last.tb_next
     ours = last is not None and last.tb_frame.f_globals.get("__name__", "").startswith("lerobot_latentsafe")
-    known = isinstance(error, OSError | ImportError | draccus.utils.DraccusException)
-    return (ours or known) and len(in_one_line(error).split()) > 3
+    system = isinstance(error, OSError | ImportError | draccus.utils.DraccusException)
+    meant = system or (ours and isinstance(error, ValueError | RuntimeError | KeyError))
+    return meant and len(in_one_line(error).split()) > 3
 
 
 def _unexplained(error: Exception) -> str:

@@ -12,9 +12,9 @@ from lerobot.utils.constants import HF_LEROBOT_HOME
 from lerobot_latentsafe.datasets.cameras import settled_cameras
 from lerobot_latentsafe.datasets.contract import Contract
 from lerobot_latentsafe.datasets.episodes import DatasetFrames
-from lerobot_latentsafe.datasets.folder import load_metadata
-from lerobot_latentsafe.datasets.reading import DatasetContractError, reading
-from lerobot_latentsafe.datasets.wholeness import INFO
+from lerobot_latentsafe.datasets.folder import load_metadata, open_dataset
+from lerobot_latentsafe.datasets.layout import INFO
+from lerobot_latentsafe.datasets.reading import DatasetContractError
 
 
 @dataclass
@@ -40,8 +40,7 @@ class DatasetSource:
     def opened(self) -> LeRobotDataset:
         """The whole dataset, after the same checks."""
         meta = self.metadata()
-        with reading(Path(meta.root)):
-            return LeRobotDataset(meta.repo_id, root=meta.root)
+        return open_dataset(meta.repo_id, meta.root)
 
     def frames(self) -> DatasetFrames:
         """The dataset's pictures, after the same checks.
@@ -58,8 +57,8 @@ class DatasetSource:
             cameras, left_out = contract.cameras, contract.left_out
         if left_out and not cameras:
             raise ValueError(
-                f"{meta.repo_id} has no pictures to look at: {', '.join(left_out)} are depth maps; record a camera "
-                "that shows colours or grey"
+                f"{meta.repo_id} has no pictures to look at: {', '.join(left_out)} are depth maps; record a "
+                "camera that shows colours or grey"
             )
         frames = DatasetFrames(meta, self.episodes)
         frames.cameras = list(cameras)
@@ -67,14 +66,20 @@ class DatasetSource:
 
     def contract(self) -> tuple[LeRobotDatasetMetadata, Contract]:
         """Metadata of the dataset, and what it says of its robot."""
-        folder = self._folder()
-        meta = self._fetched() if folder is None else load_metadata(self._id, folder)
+        meta = self.found()
         self._require_known_episodes(meta)
         return meta, Contract.read(meta)
 
+    def found(self) -> LeRobotDatasetMetadata:
+        """Metadata of the dataset, whose numbers and names are not checked."""
+        folder = self._folder()
+        return self._fetched() if folder is None else load_metadata(self._id, folder)
+
     @property
     def _id(self) -> str:
-        return self.repo_id or DatasetSource.repo_id
+        if self.repo_id not in (None, DatasetSource.repo_id):
+            return self.repo_id
+        return f"local/{Path(self.root).name}" if self.root else DatasetSource.repo_id
 
     def _folder(self) -> Path | None:
         """Where the dataset lies on this machine; None: it must be fetched."""

@@ -39,7 +39,7 @@ from lerobot_latentsafe.datasets.frame_cache import (
     dataset_fingerprint,
 )
 from lerobot_latentsafe.datasets.label_places import sidecar_path, specifications_of
-from lerobot_latentsafe.datasets.labels import Content, Sidecar
+from lerobot_latentsafe.datasets.labels import Content, Sidecar, all_labels
 from lerobot_latentsafe.encoders.perception import Perception, PerceptionConfig
 from lerobot_latentsafe.encoders.pictures import to_model_images
 from lerobot_latentsafe.runtime.files import refuse_existing, replacing
@@ -204,7 +204,8 @@ def build_frame_cache(
     Raises:
         FileExistsError: output_dir holds something else, a finished cache, or an unfinished one of something else.
         DatasetContractError: a dataset that cannot be used as it is.
-        FrameCacheError: the dataset has no camera.
+        LabelFileError: its labels are none.
+        FrameCacheError: it has no camera.
     """
     output_dir, folder = Path(output_dir), Path(output_dir) / FOLDER
     rank = int(os.environ.get("RANK", 0))
@@ -218,6 +219,7 @@ def build_frame_cache(
             f"{dataset.repo_id} has no camera to cache: {known}its features are {', '.join(dataset.meta.features)}. "
             "Record one with a camera"
         )
+    all_labels(dataset.root, dataset.meta.features, dataset.repo_id)  # refuses what training would refuse
     frames = DatasetFrames(dataset.meta, episodes)
     frames.cameras = list(contract.cameras)
     see = Sight(frames, image_size)

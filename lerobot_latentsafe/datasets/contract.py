@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lerobot_latentsafe.datasets.cameras import settled_cameras
+from lerobot_latentsafe.datasets.cameras import settled_cameras, stored_picture
 from lerobot_latentsafe.datasets.labels import read_frames
+from lerobot_latentsafe.datasets.layout import INFO
 from lerobot_latentsafe.datasets.names import settled_names
-from lerobot_latentsafe.datasets.reading import DatasetContractError
+from lerobot_latentsafe.datasets.reading import DatasetContractError, some
 from lerobot_latentsafe.datasets.renaming import rename_command, renames_of
-from lerobot_latentsafe.datasets.wholeness import INFO, check_episodes, check_videos, some
+from lerobot_latentsafe.datasets.wholeness import check_order, check_videos, require_size
 
 if TYPE_CHECKING:  # the package imports this module, and LeRobot's datasets are heavy
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
@@ -70,17 +71,24 @@ class Contract:
         check_features(meta)
         frames = read_frames(meta.root, [ACTION, STATE, "timestamp", "frame_index"])
         episode = frames["episode_index"].astype(np.int64)
-        check_episodes(meta, frames["index"], episode)
+        check_order(meta, frames["index"], episode)
         cameras, left_out = settled_cameras(meta)
-        apart = _seconds_apart(meta, frames, [key for key in cameras if key in meta.video_keys])
-        check_videos(meta, [key for key in cameras if key in meta.video_keys])
+        videos = {key: shape for key, shape in cameras.items() if key in meta.video_keys}
+        check_videos(meta, videos)
+        for key in {*cameras} - {*videos}:
+            require_size(key, stored_picture(meta, key).size[::-1], cameras[key][1:])
+        apart = _seconds_apart(meta, frames, list(videos))
         state, action = (_numbers(meta, frames, key) for key in (STATE, ACTION))
-        names = settled_names(*(_names(meta, key) for key in (STATE, ACTION)), state.shape[1], action.shape[1])
-        _check_finite(meta, episode, {STATE: (state, names[0]), ACTION: (action, names[1])})
+        state_names, action_names = settled_names(
+            _names(meta, STATE), _names(meta, ACTION), state.shape[1], action.shape[1]
+        )
+        _check_finite(meta, episode, {STATE: (state, state_names), ACTION: (action, action_names)})
         for key, why in left_out.items():
             _say_once(f"{meta.repo_id}: {key} is left out: {why}")
-        root, robot = Path(meta.root), meta.info.robot_type
-        return cls(meta.repo_id, root, robot, meta.fps, *names, cameras, left_out, episode, state, action, apart)
+        return cls(
+            meta.repo_id, Path(meta.root), meta.info.robot_type, meta.fps, state_names, action_names, cameras, left_out,
+            episode, state, action, apart,
+        )  # fmt: skip
 
     @property
     def statistics(self) -> dict[str, dict[str, np.ndarray]]:
@@ -159,9 +167,10 @@ def _check_finite(
             affected = np.unique(episode[row]).tolist()
             first = f"{names[column[0]]} is {values[row[0], column[0]]} in frame {row[0] - begins[row[0]]}"
             raise DatasetContractError(
-                f"{key} of {meta.repo_id} is not finite in {len(np.unique(row))} frames of episodes {some(affected)}: "
-                f"{first} of episode {episode[row[0]]}. Delete those episodes: lerobot-edit-dataset "
-                f"--repo_id={meta.repo_id} --root={meta.root} --operation.type=delete_episodes "
+                f"{key} of {meta.repo_id} is not finite in {len(np.unique(row))} of {len(values)} frames, in episodes "
+                f"{some(affected)}: {first} of episode {episode[row[0]]}. Make a copy without those episodes: "
+                f"lerobot-edit-dataset --repo_id={meta.repo_id} --root={meta.root} --new_repo_id={meta.repo_id}_whole "
+                f"--new_root={meta.root}_whole --operation.type=delete_episodes "
                 f"--operation.episode_indices='{affected}'"
             )
 

@@ -16,6 +16,7 @@ from lerobot_latentsafe.datasets.fingerprints import by_length_alone, episode_sp
 from lerobot_latentsafe.datasets.frame_labels import FAILING, SAFE, UNLABELLED, FrameLabels
 from lerobot_latentsafe.datasets.label_places import (
     FOLDER,
+    NAME,
     LabelFileError,
     UnlabelledDatasetError,
     label_files,
@@ -375,6 +376,31 @@ def carry_hint(folders: list[Path]) -> str:
         f"Episodes of it are labelled in {', '.join(map(str, folders))}; carry the labels over with latentsafe "
         f"carry-labels --sources='[{','.join(map(str, folders))}]'"
     )
+
+
+def all_labels(root: str | Path, features: dict[str, dict], repo_id: str | None = None) -> dict[str, np.ndarray]:
+    """The labels of all specifications that a dataset has, name -> int8 (N,).
+
+    Args:
+        features: of the dataset. `failure` must hold labels; others do if their name is fit and all values are labels.
+        repo_id: of the dataset, for label files that do not lie in its folder.
+
+    Raises:
+        LabelFileError: a label file of another dataset, or values that are no labels.
+    """
+    numbers = [name for name, f in features.items() if f["dtype"].startswith(("bool", "int", "uint", "float"))]
+    columns, found = [name for name in ["failure", *numbers] if NAME.fullmatch(name)], {}
+    content = Content(root, columns)
+    for name in sorted(set(columns) & set(content.frames)):
+        try:
+            found[name] = as_labels(content.frames[name], len(content), f"column {name!r} of {root}")
+        except LabelFileError:
+            if name == "failure":
+                raise
+    for name in specifications_of(root, repo_id):
+        if (sidecar := Sidecar.find(root, name, content, repo_id)) is not None:
+            found[name] = sidecar.failure
+    return found
 
 
 def as_labels(values: np.ndarray, n: int, source: str) -> np.ndarray:

@@ -32,3 +32,8 @@ def reading(path: Path, remedy: str = DOWNLOAD_AGAIN) -> Iterator[None]:
         raise BrokenFileError(
             f"{path} cannot be read: it is missing, cut or damaged ({reason[:200]}). Please {remedy}"
         ) from e
+
+
+def some(numbers: list) -> str:
+    """The first ten of a list, in words."""
+    return ", ".join(str(n) for n in numbers[:10]) + (f" and {len(numbers) - 10} more" if len(numbers) > 10 else "")

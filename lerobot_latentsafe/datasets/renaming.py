@@ -22,7 +22,7 @@ def renames_of(features: dict[str, dict]) -> dict[str, str]:
 
     LeRobot hands a policy `action` and what begins with `observation.`, and nothing else.
     """
-    renames = {}
+    renames: dict[str, str] = {}
     for expected, endings in MEANT.items():
         if expected not in features:
             found = [key for key, f in features.items() if _last(key) in endings and _is_number(f)]

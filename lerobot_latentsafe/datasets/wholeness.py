@@ -7,61 +7,50 @@ from typing import TYPE_CHECKING
 import av
 import numpy as np
 
-from lerobot_latentsafe.datasets.reading import DOWNLOAD_AGAIN, BrokenFileError, DatasetContractError, reading
+from lerobot_latentsafe.datasets.layout import EPISODES, INFO
+from lerobot_latentsafe.datasets.reading import DOWNLOAD_AGAIN, BrokenFileError, DatasetContractError, reading, some
 
 if TYPE_CHECKING:  # the package imports this module, and LeRobot's datasets are heavy
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
-INFO, EPISODES = "meta/info.json", "meta/episodes"
-WITHOUT_THEM = (
-    f"{DOWNLOAD_AGAIN}, or make a copy without them with lerobot-edit-dataset --operation.type=delete_episodes"
-)
 
-
-def check_episodes(meta: "LeRobotDatasetMetadata", index: np.ndarray, episode: np.ndarray) -> None:
-    """Refuse a dataset that lacks episodes or frames that its metadata promise.
+def check_order(meta: "LeRobotDatasetMetadata", index: np.ndarray, episode: np.ndarray) -> None:
+    """Refuse frames that do not lie where the metadata say.
 
     Args:
-        index, episode: (N,) of the frames that were found, in the order of the index.
+        index, episode: (N,) of the frames, in the order of the index.
 
     Raises:
-        DatasetContractError: naming the episodes.
+        DatasetContractError: with the remedy.
     """
-    listed = np.asarray(meta.episodes["episode_index"])
-    unlisted = sorted({*range(meta.total_episodes)} - {*listed.tolist()})
-    if unlisted or len(listed) != meta.total_episodes:
+    if len(index) != meta.total_frames:
         raise DatasetContractError(
-            f"{meta.root / EPISODES} lists {len(listed)} episodes, {INFO} counts {meta.total_episodes}: "
-            f"{some(unlisted) or 'some'} are missing; {WITHOUT_THEM}"
+            f"{meta.root} holds {len(index)} frames on disk, {meta.total_frames} by its {INFO}; {DOWNLOAD_AGAIN}"
         )
-    lengths = dict(zip(listed.tolist(), meta.episodes["length"]))
-    found = dict(zip(*(values.tolist() for values in np.unique(episode, return_counts=True))))
-    torn = [e for e in sorted({*lengths} | {*found}) if lengths.get(e) != found.get(e)]
-    if torn:
-        e = torn[0]
+    if not np.array_equal(index, np.arange(len(index))) or (np.diff(episode) < 0).any():
         raise DatasetContractError(
-            f"{meta.root / 'data'} holds {found.get(e, 0)} frames of episode {e}, expected {lengths.get(e, 0)}; "
-            f"episodes that do not fit: {some(torn)}. Please {WITHOUT_THEM}"
+            f"the columns index and episode_index of {meta.root / 'data'} must count up from 0, each index once; "
+            f"{DOWNLOAD_AGAIN}, or convert it again"
         )
-    if len(index) != meta.total_frames or not np.array_equal(index, np.arange(len(index))):
+    first = np.searchsorted(episode, np.asarray(meta.episodes["episode_index"]))
+    moved = np.flatnonzero(first != np.asarray(meta.episodes["dataset_from_index"])).tolist()
+    if moved:
         raise DatasetContractError(
-            f"the column index of {meta.root / 'data'} must count the frames from 0 to {meta.total_frames - 1}, each "
-            f"once; it has {len(index)} from {index[0]} to {index[-1]}. Please {DOWNLOAD_AGAIN}"
+            f"{meta.root / EPISODES} says that episodes {some(moved)} begin elsewhere than in data/; {DOWNLOAD_AGAIN}, "
+            "or convert it again"
         )
 
 
-def some(numbers: list) -> str:
-    """The first ten of a list, in words."""
-    return ", ".join(str(n) for n in numbers[:10]) + (f" and {len(numbers) - 10} more" if len(numbers) > 10 else "")
+def check_videos(meta: "LeRobotDatasetMetadata", cameras: dict[str, tuple[int, int, int]]) -> None:
+    """Refuse videos that are missing, cut off before the last frame of an episode in them, or of another size.
 
-
-def check_videos(meta: "LeRobotDatasetMetadata", cameras: list[str]) -> None:
-    """Refuse videos that are missing, cut, or cut off before the last frame of an episode in them.
+    Args:
+        cameras: key -> (C, H, W) of those that are videos.
 
     Raises:
-        BrokenFileError: naming the video and an episode in it.
+        DatasetContractError: naming the video.
     """
-    for camera in cameras:
+    for camera, (_, height, width) in cameras.items():
         ends: dict[Path, tuple[float, int]] = {}
         places = [f"videos/{camera}/{name}" for name in ("chunk_index", "file_index", "to_timestamp")]
         if missing := [place for place in places if place not in meta.episodes.column_names]:
@@ -76,23 +65,37 @@ def check_videos(meta: "LeRobotDatasetMetadata", cameras: list[str]) -> None:
                     "camera out with lerobot-edit-dataset --operation.type=remove_feature"
                 )
             with reading(path):
-                check_video_end(path, end - 1.5 / float(meta.fps))
+                check_video(path, end - 1.5 / float(meta.fps), (height, width))
 
 
-def check_video_end(path: Path, since: float) -> None:
-    """Refuse a video whose packets end before a time in seconds; only its last packets are read.
+def check_video(path: Path, since: float, size: tuple[int, int]) -> None:
+    """Refuse a video that ends before a time in seconds, or is of another (height, width); only its end is read.
 
     Raises:
-        BrokenFileError: naming the file and the time.
+        DatasetContractError: naming what was expected.
     """
     with av.open(path) as container:
         if not container.streams.video:
             raise BrokenFileError(f"{path} holds no video; {DOWNLOAD_AGAIN}")
         stream = container.streams.video[0]
+        require_size(str(path), (stream.height, stream.width), size)
         container.seek(int(max(since, 0.0) / (stream.time_base or Fraction(1, 1000))), stream=stream)
         times = [float(p.pts * p.time_base) for p in container.demux(stream) if p.pts is not None and p.size]
     if not times or max(times) < since:
         raise BrokenFileError(
             f"{path} is cut off: it has no frame after {since:.2f} s, where its episodes' last ones should be; "
             f"{DOWNLOAD_AGAIN}"
+        )
+
+
+def require_size(what: str, found: tuple[int, int], promised: tuple[int, int]) -> None:
+    """Refuse pictures of another (height, width) than a dataset's info gives.
+
+    Raises:
+        DatasetContractError: naming both.
+    """
+    if found != promised:
+        raise DatasetContractError(
+            f"the pictures of {what} have {found[0]} x {found[1]} pixels (height x width), {promised[0]} x "
+            f"{promised[1]} by {INFO}; correct the shape there"
         )

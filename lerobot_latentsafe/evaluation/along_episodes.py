@@ -113,11 +113,18 @@ def _model_inputs(model: SafetyModel, frames: DatasetFrames, episode: int) -> tu
     pieces = frames.pieces(model.world_model.image_keys, episode)
     images = ({key: model.images(images) for key, images in piece.items()} for piece in pieces)
     seen = [model.world_model.perceive(piece) for piece in images]
-    columns = frames.columns(episode, ["observation.state", "action"])
-    state, action = (torch.from_numpy(c).float().reshape(len(c), -1).to(model.device) for c in columns.values())
+    state, action = (numbers_of(frames, episode, key).to(model.device) for key in ("observation.state", "action"))
     units = model.units
     return (
         {name: torch.cat([piece[name] for piece in seen]) for name in seen[0]},
         units.normalise_state(state),
         units.heard_action(action, state),
     )
+
+
+def numbers_of(frames: DatasetFrames, episode: int, key: str) -> Tensor:
+    """The numbers of a feature in an episode: (T, D), or (T, 0) of a dataset without it."""
+    if key not in frames.meta.features:
+        return torch.zeros(frames.meta.episodes[episode]["length"], 0)
+    values = torch.from_numpy(frames.columns(episode, [key])[key]).float()
+    return values.reshape(len(values), -1)

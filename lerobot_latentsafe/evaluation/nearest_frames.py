@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from lerobot_latentsafe.datasets.episodes import DatasetFrames, shrunk
-from lerobot_latentsafe.evaluation.along_episodes import check_fit
+from lerobot_latentsafe.evaluation.along_episodes import check_fit, numbers_of
 from lerobot_latentsafe.latent import Latent
 from lerobot_latentsafe.safety_model import SafetyModel
 
@@ -49,7 +49,7 @@ class NearestFrames:
         step = -(-min(EPISODES, total) * frames.meta.total_frames // (frames.meta.total_episodes * FRAMES))
         places = np.unique(np.linspace(0, total - 1, min(EPISODES, total)).round().astype(int))
         for episode in np.array(frames.episodes)[places].tolist():
-            state = torch.from_numpy(frames.columns(episode, ["observation.state"])["observation.state"][::step])
+            state = numbers_of(frames, episode, "observation.state")[::step]
             numbers, at = range(0, frames.length(episode), step), 0
             for images in frames.pieces(self.model.world_model.image_keys, episode, numbers):
                 shown = images[self.model.config.trained_on.cameras[0]].permute(0, 2, 3, 1).numpy()
