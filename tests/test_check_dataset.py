@@ -88,8 +88,8 @@ def test_check_dataset_tells_what_to_know(capsys, tmp_path):
     root = world.record(tmp_path / "data", world.features(failure=None, **{"observation.state": None}))
     world.edit_feature(world.delete(root, "meta/stats.json"), "action", names=["all"])
     code, said = says(capsys, "check-dataset", f"--dataset.root={root}")
-    assert code == 0 and "no failure labels yet" in said.strip().splitlines()[-1]
-    for words in ("action_0, action_1 here", "without proprioception", "recompute_stats"):
+    assert code == 1 and "trained_on.meanings='{action_0: delta, action_1: delta}'" in said.strip().splitlines()[-1]
+    for words in ("action_0, action_1 here", "of unknown meaning", "without proprioception", "recompute_stats"):
         assert words in said
 
 

@@ -6,6 +6,7 @@ import numpy as np
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.video_utils import decode_video_frames
 
+from lerobot_latentsafe.datasets.adoption import displacements, told_by
 from lerobot_latentsafe.datasets.cameras import stored_picture
 from lerobot_latentsafe.datasets.contract import ACTION, STATE, Contract
 from lerobot_latentsafe.datasets.frame_cache import FOLDER, FrameCache
@@ -34,13 +35,19 @@ def rows(contract: Contract) -> list[Row]:
     ]
     table += [("camera", f"{key}: {c} channels, {h} x {w} pixels") for key, (c, h, w) in contract.cameras.items()]
     table += [("left out", f"{key}: {why}") for key, why in contract.left_out.items()]
-    for what, names, numbers in (
-        ("state", contract.state_names, contract.state),
-        ("command", contract.action_names, contract.action),
-    ):
-        table += [
-            (what, f"{name}: {low:g} to {high:g}") for name, low, high in zip(names, numbers.min(0), numbers.max(0))
-        ]
+    spans = zip(contract.state_names, contract.state.min(0), contract.state.max(0))
+    table += [("state", f"{name}: {low:g} to {high:g}") for name, low, high in spans]
+    return table + command_rows(contract)
+
+
+def command_rows(contract: Contract) -> list[Row]:
+    """What each command means, as far as names and data tell, and how far it goes."""
+    commands = told_by(contract)
+    sent, moves, table = contract.action, displacements(contract, commands), []
+    for command, low, high, least, largest in zip(commands, sent.min(0), sent.max(0), moves.min(0), moves.max(0)):
+        meaning = command.described if command.meaning else "of unknown meaning"
+        meaning += f", at {least:+.3g} to {largest:+.3g} from the state" if command.of_state else ""
+        table.append(("command", f"{command.name}: {low:g} to {high:g}, {meaning}"))
     return table
 
 
