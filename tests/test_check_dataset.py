@@ -89,7 +89,7 @@ def test_check_dataset_tells_what_to_know(capsys, tmp_path):
     world.edit_feature(world.delete(root, "meta/stats.json"), "action", names=["all"])
     code, said = says(capsys, "check-dataset", f"--dataset.root={root}")
     assert code == 0 and "no failure labels yet" in said.strip().splitlines()[-1]
-    for words in ("action_0, action_1 here", "without proprioception", "recompute_stats"):
+    for words in ("action_0, action_1 here", "without proprioception", "use_imagenet_stats=false"):
         assert words in said
 
 
