@@ -9,14 +9,22 @@ from typing import TYPE_CHECKING, Any
 
 from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
 from lerobot_latentsafe.decision import LawOptions
-from lerobot_latentsafe.envs.configuration_envs import LatentSafeBagEnv, LatentSafeBlocksEnv, LatentSafeDubinsEnv
+from lerobot_latentsafe.envs.configuration_envs import (
+    LatentSafeBagEnv,
+    LatentSafeBlocksEnv,
+    LatentSafeDubinsEnv,
+    LatentSafeSO101Env,
+)
 from lerobot_latentsafe.policies.dreamer.configuration_dreamer import LatentSafeDreamerConfig
 from lerobot_latentsafe.policies.grasp_prediction import GraspPredictionStep
 from lerobot_latentsafe.robots.franka.config_franka import LatentSafeFrankaConfig
 from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
 from lerobot_latentsafe.robots.shielded.config_shielded import LatentSafeShieldedConfig
+from lerobot_latentsafe.robots.so101_mujoco.config_so101_mujoco import LatentSafeSO101MujocoConfig
+from lerobot_latentsafe.runtime.policy_server import serve_types
 from lerobot_latentsafe.teleoperators.end_effector.config_end_effector import LatentSafeEndEffectorConfig
 from lerobot_latentsafe.teleoperators.scripted.config_scripted import LatentSafeScriptedConfig
+from lerobot_latentsafe.teleoperators.so101_leader.config_so101_leader import LatentSafeSO101LeaderConfig
 
 if TYPE_CHECKING:
     from lerobot_latentsafe.api import (
@@ -44,6 +52,9 @@ __all__ = [
     "LatentSafeFrankaConfig",
     "LatentSafeFrankaMujocoConfig",
     "LatentSafePolicy",
+    "LatentSafeSO101Env",
+    "LatentSafeSO101LeaderConfig",
+    "LatentSafeSO101MujocoConfig",
     "LatentSafeScriptedConfig",
     "LatentSafeShieldedConfig",
     "LawOptions",
@@ -55,6 +66,8 @@ __all__ = [
     "values_along",
 ]
 __version__ = "0.2.0"
+
+serve_types(["latentsafe", "latentsafe_dreamer"])
 
 
 def __getattr__(name: str) -> Any:

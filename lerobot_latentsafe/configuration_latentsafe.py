@@ -97,7 +97,7 @@ class LatentSafeConfig(PreTrainedConfig):
         Raises:
             ValueError: naming the command and what there is.
         """
-        ranges = self.trained_on.ranges
+        ranges = self.trained_on.motion_ranges
         if not ranges:
             return
         unknown = [name for name in self.fallback.named_commands if name not in ranges]

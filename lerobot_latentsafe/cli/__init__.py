@@ -60,6 +60,9 @@ VERBS: dict[str, Verb] = {
     "label": Verb("label", _LABEL, "Label", "open a local page on which a person marks where episodes fail"),
     "auto-label": Verb("label", _LABEL, "AutoLabel", "let a function or a vision-language model label the rest"),
     "check-labels": Verb("label", _LABEL, "CheckLabels", "list the labels that a trained filter disagrees with"),
+    "carry-labels": Verb(
+        "label", _LABEL, "CarryLabels", "take over labels from the datasets that one was joined or cut from"
+    ),
     "write-labels": Verb(
         "label", _LABEL, "WriteLabels", "copy a dataset with its labels as columns, and push it on request"
     ),

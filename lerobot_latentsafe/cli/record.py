@@ -4,17 +4,17 @@ from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 
-from lerobot.processor import RobotActionProcessorStep, RobotProcessorPipeline
-from lerobot.processor.converters import robot_action_observation_to_transition, transition_to_robot_action
 from lerobot.robots.config import RobotConfig
 from lerobot.scripts.lerobot_record import RecordConfig, record
 from lerobot.scripts.lerobot_teleoperate import TeleoperateConfig, teleoperate
-from lerobot.utils.constants import HF_LEROBOT_HOME
+from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME
 
 from lerobot_latentsafe.cli.options import DatasetSource, NewDataset
-from lerobot_latentsafe.collection import dubins, franka
+from lerobot_latentsafe.collection import dubins, franka, so101
+from lerobot_latentsafe.collection.sent_actions import storing_what_was_sent
 from lerobot_latentsafe.datasets.columns import write_decisions
-from lerobot_latentsafe.datasets.decisions import FILE
+from lerobot_latentsafe.datasets.decisions import FILE, check_recording
+from lerobot_latentsafe.datasets.labels import read_frames
 from lerobot_latentsafe.robots.shielded.config_shielded import LatentSafeShieldedConfig
 from lerobot_latentsafe.robots.shielded.shielded import connected_shield
 
@@ -47,6 +47,11 @@ class Collect:
     - bag_middle, bag_strong, bag_weak: demonstrations; in the last two the hand is pushed aside now and then
     - blocks_demos, blocks_random: the blocks
 
+    Sources of the SO-101, which pushes a cube to a mark near the table's edge:
+
+    - so101_careful, so101_reckless: demonstrations, to the mark, or 5.5 cm past it
+    - so101_mix: both, undisturbed and held now and then, with pushes by fits and starts and random motion
+
     If a recording of the Franka was killed, start it again: it goes on.
     """
 
@@ -64,25 +69,14 @@ class Collect:
             collect = partial(franka.collect_franka, workers=self.workers)
         elif self.source in dubins.SOURCES:
             collect = dubins.collect_dubins
+        elif self.source in so101.SOURCES:
+            collect = so101.collect_so101
         else:
-            known = ", ".join([*dubins.SOURCES, *franka.SOURCES])
+            known = ", ".join([*dubins.SOURCES, *franka.SOURCES, *so101.SOURCES])
             raise ValueError(f"--source is {self.source!r}; expected one of {known}")
         new = self.dataset
         dataset = collect(self.source, new.repo_id, new.folder, new.num_episodes, self.seed)
         print(f"{dataset.num_episodes} episodes, {dataset.num_frames} frames in {new.folder}")
-
-
-@dataclass
-class ShieldStep(RobotActionProcessorStep):
-    """The operator's action is executed here already, for what this step returns is what LeRobot stores."""
-
-    def action(self, action: dict[str, float]) -> dict[str, float]:
-        """What was executed instead of the operator's action."""
-        return connected_shield().send_early(action)
-
-    def transform_features(self, features: dict) -> dict:
-        """The features, which stay as they are."""
-        return features
 
 
 @dataclass
@@ -111,12 +105,10 @@ class Record(RecordConfig):
         journal = Path(dataset.root or HF_LEROBOT_HOME / dataset.repo_id) / FILE
         config = _lerobots(self, RecordConfig)
         config.robot = _shielded(self.robot, self.filter, fps=dataset.fps, journal=journal)
-        step = RobotProcessorPipeline(
-            [ShieldStep()],
-            to_transition=robot_action_observation_to_transition,
-            to_output=transition_to_robot_action,
-        )
-        record(config, teleop_action_processor=step)
+        with storing_what_was_sent(lambda: connected_shield().take_sent()):
+            dataset = record(config)
+        if journal.exists() and dataset.num_episodes:
+            check_recording(journal, read_frames(dataset.root, ["frame_index", ACTION]))
         print(f"the actions are what was executed; what was proposed is in {journal}")
 
 

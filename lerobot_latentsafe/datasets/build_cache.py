@@ -9,7 +9,8 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Protocol
@@ -37,15 +38,8 @@ from lerobot_latentsafe.datasets.frame_cache import (
     basis_file,
     dataset_fingerprint,
 )
-from lerobot_latentsafe.datasets.labels import FOLDER as LABELS
-from lerobot_latentsafe.datasets.labels import (
-    Sidecar,
-    all_labels,
-    identity,
-    read_frames,
-    sidecar_path,
-    specifications_of,
-)
+from lerobot_latentsafe.datasets.label_places import sidecar_path, specifications_of
+from lerobot_latentsafe.datasets.labels import Content, Sidecar, all_labels
 from lerobot_latentsafe.encoders.perception import Perception, PerceptionConfig
 from lerobot_latentsafe.encoders.pictures import to_model_images
 from lerobot_latentsafe.runtime.files import refuse_existing, replacing
@@ -57,8 +51,22 @@ ENCODED_AT_ONCE = 8
 SAMPLED_EPISODES, SAMPLED_FRAMES = 100, 4000
 """From which principal components are found."""
 
-See = Callable[[int], dict[str, Tensor]]
-"""All frames of an episode as a world model takes them: camera key -> (T, 3, S, S) in [0, 1]."""
+
+@dataclass(frozen=True)
+class Sight:
+    """Episodes as a world model takes them, a few frames at a time."""
+
+    frames: DatasetFrames
+    image_size: int
+
+    def length(self, place: int) -> int:
+        """Frames of the episode at a place among those that are kept."""
+        return self.frames.length(self.frames.episodes[place])
+
+    def pieces(self, place: int, numbers: Sequence[int] | None = None) -> Iterator[dict[str, Tensor]]:
+        """Of all its frames, or of some, in order: camera key -> (n, 3, S, S) in [0, 1]."""
+        for piece in self.frames.pieces(self.frames.cameras, self.frames.episodes[place], numbers):
+            yield {key: to_model_images(images, self.image_size) for key, images in piece.items()}
 
 
 class Recipe(Protocol):
@@ -67,7 +75,7 @@ class Recipe(Protocol):
     arrays: dict[str, tuple[tuple[int, ...], str]]
     manifest: dict
 
-    def prepare(self, folder: Path, see: See, n_episodes: int) -> None:
+    def prepare(self, folder: Path, see: Sight, n_episodes: int) -> None:
         """What one process must do before any can start."""
 
     def start(self, folder: Path) -> None:
@@ -86,14 +94,14 @@ class Pictures:
         }
         self.manifest = {"image_size": image_size, "percepts": list(cameras)}
 
-    def prepare(self, folder: Path, see: See, n_episodes: int) -> None:
+    def prepare(self, folder: Path, see: Sight, n_episodes: int) -> None:
         """Nothing is needed beforehand."""
 
     def start(self, folder: Path) -> None:
         """Nothing is needed then."""
 
     def perceive(self, images: dict[str, Tensor]) -> dict[str, np.ndarray]:
-        """The pictures of an episode: camera key -> uint8 (T, 3, S, S)."""
+        """The pictures of some frames: camera key -> uint8 (T, 3, S, S)."""
         return {key: (value * 255).round().to(torch.uint8).numpy() for key, value in images.items()}
 
 
@@ -126,7 +134,7 @@ class Tokens:
             "encoder_hash": self.perception.config.encoder_hash,
         }
 
-    def prepare(self, folder: Path, see: See, n_episodes: int) -> None:
+    def prepare(self, folder: Path, see: Sight, n_episodes: int) -> None:
         """Take the principal components from elsewhere, or find them in a sample of frames."""
         if self.basis_from is not None:
             other = FrameCache.open(self.basis_from)
@@ -146,10 +154,8 @@ class Tokens:
         episodes = rng.permutation(n_episodes)[:SAMPLED_EPISODES]
         tokens = []
         for episode in episodes:
-            images = see(int(episode))
-            n = len(next(iter(images.values())))
-            picked = rng.permutation(n)[: -(-SAMPLED_FRAMES // len(episodes))]
-            tokens.append(self._tokens({key: value[picked] for key, value in images.items()}))
+            picked = rng.permutation(see.length(episode))[: -(-SAMPLED_FRAMES // len(episodes))]
+            tokens += [self._tokens(images) for images in see.pieces(episode, np.sort(picked))]
         torch.manual_seed(0)
         self.perception.basis.fit(torch.cat(tokens))
         save_file(self.perception.basis.state_dict(), folder / BASIS)
@@ -160,7 +166,7 @@ class Tokens:
         self.manifest["basis_hash"] = hashlib.sha256((folder / BASIS).read_bytes()).hexdigest()[:16]
 
     def perceive(self, images: dict[str, Tensor]) -> dict[str, np.ndarray]:
-        """Numbers of all frames of an episode: name -> (T, ...)."""
+        """Numbers of some frames: name -> (T, ...)."""
         tokens = self._tokens(images)
         vector = self.perception.basis(tokens).numpy()
         if self.dtype == "float16":
@@ -213,10 +219,10 @@ def build_frame_cache(
             f"{dataset.repo_id} has no camera to cache: {known}its features are {', '.join(dataset.meta.features)}. "
             "Record one with a camera"
         )
-    all_labels(dataset.root, dataset.meta.features)  # refuses what training would refuse
+    all_labels(dataset.root, dataset.meta.features, dataset.repo_id)  # refuses what training would refuse
     frames = DatasetFrames(dataset.meta, episodes)
     frames.cameras = list(contract.cameras)
-    see = lambda i: _episode_images(frames, frames.episodes[i], image_size)  # noqa: E731
+    see = Sight(frames, image_size)
     kept = recipe(frames.cameras, image_size)
     keep_freed_memory()
     if rank == 0 and not unfinished:
@@ -227,29 +233,31 @@ def build_frame_cache(
     return _finish(contract, copy, kept) if _fill(copy, kept, see) else None
 
 
-def _fill(copy: LeRobotDatasetMetadata, kept: Recipe, see: See) -> bool:
+def _fill(copy: LeRobotDatasetMetadata, kept: Recipe, see: Sight) -> bool:
     """Perceive this process's share of the episodes; whether all processes have done theirs."""
     rank, world = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
     folder = Path(copy.root) / FOLDER
-    arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r+") for name in kept.arrays}
     done = np.load(folder / DONE, mmap_mode="r+")
     mine = [e for e in range(rank, copy.total_episodes, world) if not done[e]]
     for episode in tqdm(mine, desc="decoding episodes", unit="episode", disable=rank > 0):
-        first = copy.episodes[episode]["dataset_from_index"]
-        for name, values in kept.perceive(see(episode)).items():
-            arrays[name][first : first + len(values)] = values
-            arrays[name].flush()
+        row = copy.episodes[episode]
+        at = row["dataset_from_index"]
+        for piece in see.pieces(episode):
+            for name, values in kept.perceive(piece).items():
+                _array(folder, name)[at : at + len(values)] = values
+            at += len(values)
+        if at != row["dataset_to_index"]:
+            raise FrameCacheError(f"{copy.root}: episode {episode} ends at frame {at}, not {row['dataset_to_index']}")
+        for name in kept.arrays:
+            _array(folder, name).flush()
         done[episode] = True
         done.flush()
     return bool(done.all())
 
 
-def _episode_images(frames: DatasetFrames, episode: int, image_size: int) -> dict[str, Tensor]:
-    images = {}
-    for key in frames.cameras:
-        stored = torch.from_numpy(frames.images(key, episode)).permute(0, 3, 1, 2)
-        images[key] = torch.cat([to_model_images(part, image_size) for part in stored.split(32)])
-    return images
+def _array(folder: Path, name: str) -> np.ndarray:
+    """An array to write into; what was written leaves this process's memory with it."""
+    return np.load(folder / f"{name}.npy", mmap_mode="r+")
 
 
 def _layout(dataset: LeRobotDataset, episodes: list[int], kept: Recipe) -> list:
@@ -259,7 +267,7 @@ def _layout(dataset: LeRobotDataset, episodes: list[int], kept: Recipe) -> list:
 
 
 def _lay_out(
-    dataset: LeRobotDataset, contract: Contract, episodes: list[int], output_dir: Path, kept: Recipe, see: See
+    dataset: LeRobotDataset, contract: Contract, episodes: list[int], output_dir: Path, kept: Recipe, see: Sight
 ) -> None:
     """Copy the dataset without images and make room for all frames; output_dir appears when that is done."""
     begun = output_dir.with_name(f"{output_dir.name}.begun")
@@ -294,19 +302,16 @@ def _without_cameras(dataset: LeRobotDataset, episodes: list[int], folder: Path)
 
 
 def _copy_labels(dataset: LeRobotDataset, episodes: list[int], folder: Path) -> None:
-    """The label files of these episodes for the copy of a dataset."""
-    labels = Path(dataset.root) / LABELS
-    if len(episodes) == dataset.num_episodes and labels.exists():
-        shutil.copytree(labels, folder / LABELS)
-        return
-    frames, kept = (read_frames(root, ["action"]) for root in (dataset.root, folder))
-    rows, n = np.isin(frames["episode_index"], episodes), len(kept["index"])
-    for name in specifications_of(dataset.root):
-        path = sidecar_path(folder, name)
-        path.parent.mkdir(exist_ok=True)
-        whole = Sidecar.read(sidecar_path(dataset.root, name), frames)
-        part = Sidecar(whole.failure[rows], whole.by[rows], whole.at[rows], whole.names)
-        part.write(path, dataset.repo_id, identity(kept, n))
+    """The labels of these episodes for the copy of a dataset, wherever their files lie."""
+    content, kept = Content(dataset.root), Content(folder)
+    rows = np.isin(content.frames["episode_index"], episodes)
+    for name in specifications_of(dataset.root, dataset.repo_id):
+        whole = Sidecar.find(dataset.root, name, content, dataset.repo_id)
+        if whole is not None:
+            path = sidecar_path(folder, name)
+            path.parent.mkdir(exist_ok=True)
+            part = Sidecar(whole.failure[rows], whole.by[rows], whole.at[rows], whole.names)
+            part.write(path, dataset.repo_id, kept)
 
 
 def _await_layout(expected: list, folder: Path, patience_s: float = 600) -> None:

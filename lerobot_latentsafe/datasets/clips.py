@@ -25,7 +25,7 @@ class Clip:
     Attributes:
         percepts: what `WorldModel.perceive` makes of each frame's images: name -> (B, T, ...).
         state: (B, T, S) proprioception.
-        action: (B, T, A) in [-1, 1], the action that led to each frame; zero where is_first.
+        action: (B, T, A), the motion that led to each frame, as the world model hears it; none where is_first.
         is_first: bool (B, T), frames with no past.
         valid: bool (B, T), False for padding.
         failure: (B, T), 1 failing, 0 safe, -1 unlabelled.
@@ -103,7 +103,7 @@ class FilterData:
             ValueError: no camera at all, or none of that name.
         """
         contract = Contract.read(meta)
-        labels = FailureLabels.load(meta.root, specification)
+        labels = FailureLabels.load(meta.root, specification, meta.repo_id)
         if frame_cache is None and (Path(meta.root) / FOLDER).exists():
             frame_cache = str(meta.root)
         cache, shapes = None, contract.cameras
@@ -227,10 +227,12 @@ class ClipReader:
         units, device = self.units, self.units.device
         is_first = torch.zeros(window.shape, dtype=torch.bool, device=device)
         is_first[:, 0] = True
-        action = units.normalise_action(action.to(device).float()).clamp(-1, 1)
+        state = state.to(device).float()
+        before = torch.cat([state[:, :1], state[:, :-1]], 1)  # the state at which each action was chosen
+        action = units.heard_action(action.to(device).float(), before)
         return Clip(
             percepts=percepts,
-            state=units.normalise_state(state.to(device)),
+            state=units.normalise_state(state),
             action=torch.where(is_first[..., None], units.first_action(action), action),
             is_first=is_first,
             valid=valid.to(device),

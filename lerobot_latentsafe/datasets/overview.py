@@ -73,7 +73,7 @@ def label_rows(meta: LeRobotDatasetMetadata) -> list[Row]:
     kinds = (("failing", FAILING), ("safe", SAFE), ("not labelled", UNLABELLED))
     return [
         ("labels", f"{name}: {', '.join(f'{(labels == value).sum()} {kind}' for kind, value in kinds)}")
-        for name, labels in all_labels(meta.root, meta.features).items()
+        for name, labels in all_labels(meta.root, meta.features, meta.repo_id).items()
     ]
 
 

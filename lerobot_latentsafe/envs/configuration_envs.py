@@ -9,6 +9,7 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGE, OBS_IMAGES
 
 from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES
 from lerobot_latentsafe.franka.scenes import SCENES, check_scene
+from lerobot_latentsafe.so101 import actions as so101
 
 
 @dataclass
@@ -128,6 +129,51 @@ class LatentSafeBlocksEnv(FrankaEnv):
     fps: int = SCENES["blocks"].fps
 
 
+@EnvConfig.register_subclass("latentsafe_so101")
+@dataclass
+class LatentSafeSO101Env(EnvConfig):
+    """Push a cube to a mark with an SO-101, and not over the table's edge (see `so101/scene.py`).
+
+    Attributes:
+        episode_length: control steps.
+        image_size: side of both cameras' pictures.
+    """
+
+    task: str | None = "SO101-v0"
+    fps: int = so101.FPS
+    episode_length: int = round(so101.EPISODE_SECONDS * so101.FPS)
+    image_size: int = so101.IMAGE_SIZE
+    features: dict[str, PolicyFeature] = field(
+        default_factory=lambda: {
+            ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(len(so101.NAMES),)),
+            "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(len(so101.NAMES),)),
+        }
+    )
+    features_map: dict[str, str] = field(
+        default_factory=lambda: {
+            ACTION: ACTION,
+            "agent_pos": OBS_STATE,
+            **{f"pixels/{camera}": f"{OBS_IMAGES}.{camera}" for camera in so101.CAMERAS},
+        }
+    )
+
+    def __post_init__(self) -> None:
+        so101.check_image_size(self.image_size)
+        for camera in so101.CAMERAS:
+            shape = (self.image_size, self.image_size, 3)
+            self.features[f"pixels/{camera}"] = PolicyFeature(type=FeatureType.VISUAL, shape=shape)
+
+    @property
+    def package_name(self) -> str:
+        """Of the gymnasium ids."""
+        return "lerobot_latentsafe"
+
+    @property
+    def gym_kwargs(self) -> dict:
+        """What the environment is made with."""
+        return {"episode_length": self.episode_length, "image_size": self.image_size}
+
+
 def _register(gym_id: str, entry_point: str) -> None:
     if gym_id not in gym.registry:
         gym.register(gym_id, entry_point=entry_point, disable_env_checker=True)
@@ -136,3 +182,4 @@ def _register(gym_id: str, entry_point: str) -> None:
 _register("lerobot_latentsafe/Dubins-v0", "lerobot_latentsafe.envs.dubins_env:DubinsEnv")
 _register("lerobot_latentsafe/Bag-v0", "lerobot_latentsafe.envs.franka_env:BagEnv")
 _register("lerobot_latentsafe/Blocks-v0", "lerobot_latentsafe.envs.franka_env:BlocksEnv")
+_register("lerobot_latentsafe/SO101-v0", "lerobot_latentsafe.envs.so101_env:SO101Env")

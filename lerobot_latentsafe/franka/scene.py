@@ -7,7 +7,6 @@ A scene is used through a LeRobot robot (`robots/franka_mujoco`) and through gym
 """
 
 import copy
-import os
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,7 @@ from lerobot_latentsafe.franka.actions import (
     WORKSPACE_LOW,
     action_limits,
 )
+from lerobot_latentsafe.runtime.rendering import make_renderer
 
 ASSETS = Path(__file__).parent / "assets"
 CAMERAS = ("front", "wrist")
@@ -228,7 +228,7 @@ class FrankaScene:
             RuntimeError: there is no OpenGL library to draw with.
         """
         if self._renderer is None:
-            self._renderer = _make_renderer(self.model, self.image_size)
+            self._renderer = make_renderer(self.model, self.image_size)
         self._renderer.update_scene(self.data, camera)
         return self._renderer.render()
 
@@ -275,17 +275,3 @@ class FrankaScene:
 def _copy(controller: Controller) -> Controller:
     values: dict[str, Any] = {f.name: copy.copy(getattr(controller, f.name)) for f in fields(controller)}
     return Controller(**values)
-
-
-def _make_renderer(model: mujoco.MjModel, size: int) -> mujoco.Renderer:
-    # Software OpenGL is fastest drawing in the calling thread, and leaves the other cores to other processes.
-    os.environ.setdefault("LP_NUM_THREADS", "0")
-    try:
-        return mujoco.Renderer(model, size, size, max_geom=400)
-    except Exception as e:
-        raise RuntimeError(
-            f"MuJoCo cannot make an OpenGL context with MUJOCO_GL={os.environ.get('MUJOCO_GL', '')!r} ({e}). "
-            "Without a display use MUJOCO_GL=egl with libegl1 and libgl1-mesa-dri (Debian: apt-get install libegl1 "
-            "libgl1-mesa-dri), or MUJOCO_GL=osmesa with libosmesa6; set it in the shell if another package imports "
-            "MuJoCo first"
-        ) from e

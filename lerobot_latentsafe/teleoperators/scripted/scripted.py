@@ -10,7 +10,8 @@ from lerobot.utils.errors import DeviceNotConnectedError
 from lerobot_latentsafe.franka.actions import ACTION_NAMES, action_limits
 from lerobot_latentsafe.franka.behaviors import begin
 from lerobot_latentsafe.robots.franka_device import FrankaDevice
-from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import connected_simulation
+from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
+from lerobot_latentsafe.robots.simulated import connected_simulation
 from lerobot_latentsafe.teleoperators.scripted.config_scripted import LatentSafeScriptedConfig
 
 
@@ -47,7 +48,7 @@ class LatentSafeScripted(FrankaDevice, Teleoperator):
         """The next action; clipped into its limits, so that what is recorded is what is executed."""
         if not self._connected:
             raise DeviceNotConnectedError(f"{self} is not connected; call connect() first")
-        robot = connected_simulation()
+        robot = connected_simulation(LatentSafeFrankaMujoco)
         if self._episode != (robot, robot.episode):
             self._episode = (robot, robot.episode)
             rng = np.random.default_rng([self.config.seed, robot.scene.seed])

@@ -1,0 +1,108 @@
+"""Recording the simulated SO-101 in bulk, through the same robot and leader arm as lerobot-record."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from lerobot.configs.video import RGBEncoderConfig
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from tqdm import tqdm
+
+from lerobot_latentsafe.datasets.labels import FAILING, SAFE
+from lerobot_latentsafe.robots.so101_mujoco.config_so101_mujoco import LatentSafeSO101MujocoConfig
+from lerobot_latentsafe.robots.so101_mujoco.so101_mujoco import LatentSafeSO101Mujoco
+from lerobot_latentsafe.runtime.files import refuse_existing
+from lerobot_latentsafe.so101.actions import CAMERAS, EPISODE_SECONDS, FPS, IMAGE_SIZE, NAMES
+from lerobot_latentsafe.teleoperators.so101_leader.config_so101_leader import LatentSafeSO101LeaderConfig
+from lerobot_latentsafe.teleoperators.so101_leader.so101_leader import LatentSafeSO101Leader
+
+
+@dataclass(frozen=True)
+class Part:
+    """So many episodes of a behaviour in a dataset of full size; smaller ones keep the proportions."""
+
+    behavior: str
+    episodes: int
+    interrupted: bool = False
+
+
+SOURCES: dict[str, tuple[Part, ...]] = {
+    "so101_careful": (Part("careful", 150),),
+    "so101_reckless": (Part("reckless", 150),),
+    "so101_mix": (
+        Part("careful", 30), Part("careful", 30, True), Part("reckless", 30), Part("reckless", 60, True),
+        Part("dally", 110), Part("wander", 40),
+    ),
+}  # fmt: skip
+"""What `latentsafe collect --source=...` can record of the SO-101."""
+
+_IMAGE = {"dtype": "video", "shape": (IMAGE_SIZE, IMAGE_SIZE, 3), "names": ["height", "width", "channels"]}
+FEATURES: dict[str, dict] = {
+    **{f"observation.images.{camera}": dict(_IMAGE) for camera in CAMERAS},
+    "observation.state": {"dtype": "float32", "shape": (len(NAMES),), "names": NAMES},
+    "action": {"dtype": "float32", "shape": (len(NAMES),), "names": NAMES},
+    "failure": {"dtype": "int64", "shape": (1,), "names": None},
+    "next.reward": {"dtype": "float32", "shape": (1,), "names": None},
+    "next.success": {"dtype": "bool", "shape": (1,), "names": None},
+    "next.done": {"dtype": "bool", "shape": (1,), "names": None},
+}
+"""Of the datasets; labels and rewards are no inputs of a policy (see `labels.py`)."""
+
+
+def part_of(name: str, episode: int) -> Part:
+    """Who moves the arm in an episode: the parts follow each other in a fixed shuffle of the whole mix, over and over."""
+    parts = [part for part in SOURCES[name] for _ in range(part.episodes)]
+    return parts[int(np.random.default_rng(0).permutation(len(parts))[episode % len(parts)])]
+
+
+def collect_so101(name: str, repo_id: str, root: str | Path, n_episodes: int | None, seed: int) -> LeRobotDataset:
+    """Record a source; None records it whole. Episode i depends on the seed and i only.
+
+    Raises:
+        ValueError: unknown source.
+        FileExistsError: root exists.
+    """
+    if name not in SOURCES:
+        raise ValueError(f"--source is {name!r}; expected one of {', '.join(SOURCES)}")
+    refuse_existing(root, "--dataset.root")
+    n_episodes = n_episodes or sum(part.episodes for part in SOURCES[name])
+    dataset = LeRobotDataset.create(
+        repo_id, FPS, FEATURES, root=root, robot_type=LatentSafeSO101Mujoco.name, streaming_encoding=True,
+        encoder_threads=1, metadata_buffer_size=100,
+        rgb_encoder=RGBEncoderConfig(vcodec="h264", preset="veryfast", crf=20),
+    )  # fmt: skip
+    with LatentSafeSO101Mujoco(LatentSafeSO101MujocoConfig()) as robot:
+        for episode in tqdm(range(n_episodes), desc=f"collecting {name}", unit="episode"):
+            robot.reset(1_000_000 * seed + episode)
+            for frame in episode_frames(robot, part_of(name, episode), episode):
+                dataset.add_frame(frame)
+            dataset.save_episode()
+    dataset.finalize()
+    return dataset
+
+
+def episode_frames(robot: LatentSafeSO101Mujoco, part: Part, seed: int) -> Iterator[dict]:
+    """The frames of an episode as `LeRobotDataset.add_frame` takes them; the first failing frame and all after fail."""
+    failed = False
+    with LatentSafeSO101Leader(LatentSafeSO101LeaderConfig(**_options(part), seed=seed)) as leader:
+        for _ in range(round(EPISODE_SECONDS * FPS)):
+            seen, truth = robot.get_observation(), robot.scene.truth()
+            failed |= truth["failure"]
+            sent = robot.send_action(leader.get_action())
+            after = robot.scene.truth()
+            yield {
+                **{f"observation.images.{camera}": seen[camera] for camera in CAMERAS},
+                "observation.state": np.array([seen[name] for name in NAMES], np.float32),
+                "action": np.array([sent[name] for name in NAMES], np.float32),
+                "failure": np.array([FAILING if failed else SAFE]),
+                "next.reward": np.array([after["reward"]], np.float32),
+                "next.success": np.array([after["is_success"] and not failed]),
+                # Nothing ends by itself: an episode lasts its time, and its last state could go on.
+                "next.done": np.array([False]),
+                "task": robot.scene.task,
+            }
+
+
+def _options(part: Part) -> dict:
+    return {"behavior": part.behavior, "interrupted": part.interrupted}
