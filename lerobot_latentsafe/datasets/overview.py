@@ -11,7 +11,7 @@ from lerobot_latentsafe.datasets.cameras import stored_picture
 from lerobot_latentsafe.datasets.contract import ACTION, STATE, Contract
 from lerobot_latentsafe.datasets.frame_cache import FOLDER, FrameCache
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE, UNLABELLED, all_labels
-from lerobot_latentsafe.datasets.layout import INFO, STATISTICS
+from lerobot_latentsafe.datasets.layout import INFO, NO_STATISTICS, STATISTICS, lacks_statistics
 from lerobot_latentsafe.datasets.names import usable_names
 from lerobot_latentsafe.datasets.reading import reading
 
@@ -112,11 +112,8 @@ def advice(meta: LeRobotDatasetMetadata, contract: Contract) -> Iterator[str]:
             )
     if not contract.state_names:
         yield f"there is no {STATE}: a filter sees pictures alone, without proprioception"
-    if not (meta.root / STATISTICS).exists():
-        yield (
-            f"{STATISTICS} is missing: the filter needs none, but lerobot-train does. Run latentsafe cache and train "
-            "on that, or lerobot-edit-dataset --operation.type=recompute_stats --operation.overwrite=true"
-        )
+    if lacks_statistics(meta.root, meta.camera_keys):
+        yield f"{STATISTICS} is missing or lacks a camera: {NO_STATISTICS}"
     if any(key in meta.video_keys for key in contract.cameras) and contract.seconds_apart > ON_TIME:
         yield f"timestamps are off: give lerobot-train --tolerance_s={2 * contract.seconds_apart:.2g}"
     for key in contract.cameras:
