@@ -102,7 +102,7 @@ class PushScene:
         return self.data.site_xpos[self.tip].copy()
 
     def truth(self) -> dict[str, float | bool | np.ndarray]:
-        """Privileged: `margin` (m to the edge), `failure`, `is_success`, `severity` (share of the cube past the edge)."""
+        """Privileged. `margin`: m to the edge; `severity`: share of the cube past it, 0 to 1."""
         cube = self.cube_position()
         failure = bool(cube[0] > EDGE or cube[2] < 0)
         on_mark = bool(abs(cube[0] - self.mark) < ON_MARK and not failure)
