@@ -94,16 +94,16 @@ def test_environment_and_robot_show_the_same(robot):
 
 
 def test_collected_episodes_are_labelled_and_depend_on_the_seed_alone(tmp_path, monkeypatch):
-    monkeypatch.setattr(so101, "EPISODE_SECONDS", 3.0)
+    monkeypatch.setattr(so101, "EPISODE_SECONDS", 3.5)
     for name in ("once", "again"):
-        so101.collect_so101("so101_reckless", "me/cube", tmp_path / name, 2, seed=1)
+        so101.collect_so101("so101_reckless", "me/cube", tmp_path / name, 2, seed=0)
     datasets = [LeRobotDataset("me/cube", root=tmp_path / name) for name in ("once", "again")]
     for column in ("observation.state", "action", "failure"):
         np.testing.assert_array_equal(*(np.array(dataset.hf_dataset[column]) for dataset in datasets))
     labels = FailureLabels.load(tmp_path / "once")
     for episode in range(2):
         assert (np.diff(labels.failure[labels.episode == episode]) >= 0).all()
-    assert datasets[0].meta.info.robot_type == "so101_follower" and datasets[0].num_frames == 180
+    assert datasets[0].meta.info.robot_type == "so101_follower" and datasets[0].num_frames == 210
     assert datasets[0][0]["observation.images.wrist"].shape == (3, 64, 64)
 
 
