@@ -2,14 +2,19 @@
 
 import logging
 import re
+import sys
 from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pyarrow.parquet as pq
+from lerobot.utils.constants import ACTION
+from lerobot.utils.import_utils import require_package
+from torch import Tensor
 
 if TYPE_CHECKING:
     from lerobot.configs.policies import PreTrainedConfig
+    from lerobot.configs.train import TrainPipelineConfig
     from lerobot.policies.pretrained import PreTrainedPolicy
 
 RECORDING = re.compile(r"Recording episode (\d+)$")
@@ -19,6 +24,9 @@ RESETTING = "Reset the environment"
 RETURNING = "Returning robot to initial position"
 """What they log before they move the robot back."""
 
+ADAPTER = "adapter_config.json"
+"""The file beside a policy's config.json that makes it a PEFT adapter."""
+
 NOT_AVERAGED = "_ddp_params_and_buffers_to_ignore"
 """The attribute in which torch's DistributedDataParallel, which LeRobot wraps policies in, looks for names."""
 
@@ -26,6 +34,17 @@ NOT_AVERAGED = "_ddp_params_and_buffers_to_ignore"
 def quiet_decoder() -> None:
     """torchcodec without system FFmpeg logs a page of traceback; LeRobot then falls back to pyav by itself."""
     logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
+
+
+def training_run() -> "TrainPipelineConfig | None":
+    """The options of the lerobot-train that is at work just now, if any: LeRobot hands them to no policy."""
+    frame = sys._getframe(1)
+    while frame is not None:
+        for options in (frame.f_locals.get("cfg"), frame.f_locals.get("self")):
+            if type(options).__name__ == "TrainPipelineConfig":
+                return options
+        frame = frame.f_back
+    return None
 
 
 def drop_episode_statistics(root: Path, features: list[str]) -> None:
@@ -39,17 +58,38 @@ def drop_episode_statistics(root: Path, features: list[str]) -> None:
         pq.write_table(table.drop_columns([c for c in table.column_names if c.startswith(left_over)]), file)
 
 
+def is_lerobots(policy: "PreTrainedPolicy") -> bool:
+    """Whether LeRobot wrote the policy's class, so that what is said here of its insides holds."""
+    return type(policy).__module__.startswith("lerobot.policies.")
+
+
+def forget_plan(policy: "PreTrainedPolicy") -> None:
+    """Have a policy plan anew from what it sees next.
+
+    `reset` drops whatever a policy plans, under whatever name: queues, averages, the start of a search. It also drops
+    what the policy saw. LeRobot's policies keep that in `_queues`, and get it back. One that remembers more than it
+    saw (lingbot_va takes its plan for what was executed) begins anew.
+    """
+    seen = observation_queues(policy) if is_lerobots(policy) else {}
+    policy.reset()
+    if seen:
+        policy._queues.update(seen)
+
+
 def queued_actions(policy: "PreTrainedPolicy") -> deque | None:
-    """The queue that a LeRobot policy plays its chunks from, if it has one."""
-    queues = getattr(policy, "_queues", None)
-    if isinstance(queues, dict) and "action" in queues:
-        return queues["action"]
-    return getattr(policy, "_action_queue", None)
+    """The queue that a LeRobot policy plays its chunks from, if it has one.
+
+    Some have two (pi0): `_action_queue` is then the one that is played.
+    """
+    queue = getattr(policy, "_action_queue", None)
+    if queue is not None:
+        return queue
+    return (getattr(policy, "_queues", None) or {}).get(ACTION)
 
 
 def observation_queues(policy: "PreTrainedPolicy") -> dict[str, deque]:
-    """What a LeRobot policy remembers of observations and actions: key -> the last ones."""
-    return getattr(policy, "_queues", {})
+    """What a LeRobot policy remembers of what it saw: key -> the last ones."""
+    return {key: past for key, past in (getattr(policy, "_queues", None) or {}).items() if key != ACTION}
 
 
 def set_observation_queues(policy: "PreTrainedPolicy", queues: dict[str, deque]) -> None:
@@ -57,8 +97,50 @@ def set_observation_queues(policy: "PreTrainedPolicy", queues: dict[str, deque])
     policy._queues = queues
 
 
+def plans_apart(policy: "PreTrainedPolicy") -> bool:
+    """Whether `predict_action_chunk` leaves the policy as it was, so that a copy of it can plan in another thread."""
+    return queued_actions(policy) is not None and policy.config.type != "lingbot_va"
+
+
 def planned_actions(config: "PreTrainedConfig") -> int:
-    """How many actions from now on a policy plans, of which it plays the first `n_action_steps`."""
+    """How many actions, one a tick, a policy plans from now on; it plays the first of them, see `played_actions`."""
+    if getattr(config, "n_action_repeats", 1) > 1 or not getattr(config, "use_mpc", True):
+        return 1  # tdmpc: its plan is not of ticks, or is a single action
     if hasattr(config, "horizon"):  # of a diffusion policy, counted from its first observation on
         return config.horizon - config.n_obs_steps + 1
-    return getattr(config, "chunk_size", getattr(config, "n_action_steps", 1))
+    return getattr(config, "chunk_size", played_actions(config))
+
+
+def played_actions(config: "PreTrainedConfig") -> int:
+    """How many actions of a plan a policy plays before it plans again."""
+    return getattr(config, "n_action_steps", getattr(config, "action_chunk_size", 1))
+
+
+def plan_chunk(policy: "PreTrainedPolicy", batch: dict) -> Tensor:
+    """All actions that a policy plans, not only those that it plays: (B, N, A)."""
+    config = policy.config
+    played = getattr(config, "n_action_steps", None)
+    if played is not None:  # some cut their plan to what is played
+        config.n_action_steps = planned_actions(config)
+    try:
+        chunk = policy.predict_action_chunk(batch)
+    finally:
+        if played is not None:
+            config.n_action_steps = played
+    return chunk.transpose(0, 1) if config.type == "tdmpc" else chunk  # tdmpc: (N, B, A)
+
+
+def merged_adapter(policy: "PreTrainedPolicy", folder: Path) -> "PreTrainedPolicy":
+    """A policy with a PEFT adapter of it merged into its weights: a policy like any other.
+
+    Raises:
+        ImportError: peft is not installed.
+        ValueError: an adapter that is not a change of weights.
+    """
+    require_package("peft", extra="peft")
+    from peft import PeftModel
+
+    adapted = PeftModel.from_pretrained(policy, str(folder))
+    if not hasattr(adapted, "merge_and_unload"):
+        raise ValueError(f"the adapter {folder} cannot be merged into weights; shield a policy with a LoRA adapter")
+    return adapted.merge_and_unload().eval()

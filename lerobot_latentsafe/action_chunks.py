@@ -2,13 +2,21 @@
 
 import copy
 from collections import deque
-from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TYPE_CHECKING
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from lerobot_latentsafe._compat import observation_queues, planned_actions, queued_actions, set_observation_queues
+from lerobot_latentsafe._compat import (
+    observation_queues,
+    plan_chunk,
+    planned_actions,
+    plans_apart,
+    played_actions,
+    queued_actions,
+    set_observation_queues,
+)
 
 if TYPE_CHECKING:
     from lerobot.policies.pretrained import PreTrainedPolicy
@@ -30,15 +38,31 @@ class ChunksAhead:
     """
 
     def __init__(self, policy: "PreTrainedPolicy", ahead: int):
-        self.policy, self.ahead, self.played = policy, ahead, getattr(policy.config, "n_action_steps", 1)
+        self.policy, self.ahead, self.played = policy, ahead, played_actions(policy.config)
+        wrong = f"--policy.base_ahead is {ahead}, but the base policy ({policy.config.type})"
+        if not plans_apart(policy):
+            raise ValueError(f"{wrong} makes no chunks that can be begun ahead; give 0")
         planned = planned_actions(policy.config)
-        if queued_actions(policy) is None or planned < ahead + 2:
+        if planned < ahead + 2:
             raise ValueError(
-                f"--policy.base_ahead is {ahead}, but the base policy ({policy.config.type}) plans {planned} actions; "
-                f"expected at most {max(planned - 2, 0)} (0: chunks are made on the control thread)"
+                f"{wrong} plans {planned} actions; expected at most {max(planned - 2, 0)} (0: chunks are made on the "
+                "control thread)"
             )
-        self._worker = ThreadPoolExecutor(1, thread_name_prefix="chunks")
+        self._worker = _worker()
         self.reset()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """A copy plans anew, in a thread of its own."""
+        self.settle()
+        return {**self.__dict__, "_worker": None, "_next": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _worker=_worker())
+
+    def settle(self) -> None:
+        """Wait until no plan is being made, which needs the policy's configuration changed."""
+        if self._next is not None:
+            wait([self._next])
 
     def reset(self) -> None:
         """Start an episode."""
@@ -67,10 +91,11 @@ class ChunksAhead:
 
     def _remember(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """Have the policy take in an observation, without planning. Returns what its chunk is made of."""
-        queue = queued_actions(self.policy)
-        queue.clear()
-        queue.append(None)  # a policy that still has an action to play plans none
-        self.policy.select_action(dict(batch))
+        if observation_queues(self.policy):
+            queue = queued_actions(self.policy)
+            queue.clear()
+            queue.append(None)  # a policy that still has an action to play plans none
+            self.policy.select_action(dict(batch))
         seen = {key: past[-1] for key, past in observation_queues(self.policy).items() if past}
         return {key: value for key, value in {**batch, **seen}.items() if key != "action"}
 
@@ -84,9 +109,15 @@ class ChunksAhead:
     @torch.no_grad()
     def _plan(self, planner: "PreTrainedPolicy", batch: dict[str, Tensor]) -> Tensor:
         """A chunk (B, N, A), as long as it is planned; meanwhile nobody plays from the policy's own queue."""
-        config = planner.config
-        config.n_action_steps = planned_actions(config)
-        try:
-            return planner.predict_action_chunk(batch)
-        finally:
-            config.n_action_steps = self.played
+        chunk = plan_chunk(planner, dict(batch))
+        rows = next(len(value) for key, value in batch.items() if key.startswith("observation."))
+        if chunk.dim() != 3 or len(chunk) != rows:
+            raise ValueError(
+                f"the base policy ({planner.config.type}) planned a chunk of shape {tuple(chunk.shape)}; expected "
+                f"({rows}, actions, numbers of an action). Give --policy.base_ahead=0"
+            )
+        return chunk
+
+
+def _worker() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(1, thread_name_prefix="chunks")

@@ -27,6 +27,7 @@ from lerobot_latentsafe.base_policy import BasePolicy
 from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
 from lerobot_latentsafe.datasets.build_cache import build_frame_cache
 from lerobot_latentsafe.datasets.episodes import DatasetFrames
+from lerobot_latentsafe.datasets.folder import open_dataset
 from lerobot_latentsafe.datasets.frame_cache import FOLDER
 from lerobot_latentsafe.decision import FilterDecision, LawOptions
 from lerobot_latentsafe.evaluation.along_episodes import EpisodeValues
@@ -102,10 +103,11 @@ def values_along(
         root: its folder, if only the id is given and it is not in LeRobot's home.
 
     Raises:
+        DatasetContractError: no dataset in that folder, or a broken one.
         ValueError: the dataset is of another robot, rate or camera than the filter's.
     """
     if not isinstance(dataset, LeRobotDataset):
-        dataset = LeRobotDataset(dataset, root=root)
+        dataset = open_dataset(dataset, root)
     return model_values_along(filter.model, DatasetFrames(dataset.meta), episode)
 
 
@@ -159,14 +161,15 @@ def train_filter(
         reachability_steps: gradient steps of the critic; by default the configuration's.
 
     Raises:
+        DatasetContractError: a dataset that cannot be used as it is.
         UnlabelledDatasetError: no failure labels.
         FileExistsError: output_dir holds a filter already.
     """
     config = config or LatentSafeConfig(device="cpu", push_to_hub=False, scheduler_steps=steps)
-    dataset, output_dir = LeRobotDataset(repo_id, root=root), Path(output_dir)
+    dataset, output_dir = open_dataset(repo_id, root), Path(output_dir)
     if not (Path(dataset.root) / FOLDER).exists():
         build_frame_cache(dataset, output_dir / "cache", config.world_model.image_size)
-        dataset = LeRobotDataset(f"{repo_id}_cache", root=output_dir / "cache")
+        dataset = open_dataset(f"{repo_id}_cache", output_dir / "cache")
     cache = str(dataset.root)
     run = TrainPipelineConfig(
         dataset=DatasetConfig(repo_id=dataset.repo_id, root=cache),

@@ -1,17 +1,24 @@
 """The policy to be shielded: any LeRobot policy with its own processors."""
 
+import json
+import logging
+from collections.abc import Sequence
 from pathlib import Path
 
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.policies.pretrained import PreTrainedPolicy
-from lerobot.processor import PolicyProcessorPipeline
-from safetensors import SafetensorError
+from lerobot.processor import PolicyProcessorPipeline, RelativeActionsProcessorStep
+from lerobot.utils.constants import OBS_STATE
+from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from lerobot_latentsafe._compat import queued_actions
+from lerobot_latentsafe._compat import ADAPTER, forget_plan, is_lerobots, merged_adapter
 from lerobot_latentsafe.action_chunks import ChunksAhead
-from lerobot_latentsafe.runtime.checkpoint import CheckpointError, read_config, resolve_checkpoint
+from lerobot_latentsafe.origin import Origin, inverse, order
+from lerobot_latentsafe.runtime.checkpoint import WEIGHTS, CheckpointError, read_config, resolve_checkpoint
+
+logger = logging.getLogger(__name__)
 
 
 class BasePolicy:
@@ -21,42 +28,57 @@ class BasePolicy:
         policy: what acts.
         preprocessor, postprocessor: LeRobot's pipelines of that policy.
         ahead: if not 0, its chunks are made off the control thread; see `ChunksAhead`.
+        origin: what is known of the data it was trained on; by default what its configuration says.
+
+    Raises:
+        ValueError: it is itself a filter, or cannot choose one action at a time.
     """
 
     def __init__(
         self, policy: PreTrainedPolicy, preprocessor: PolicyProcessorPipeline, postprocessor: PolicyProcessorPipeline,
-        ahead: int = 0,
+        ahead: int = 0, origin: Origin | None = None,
     ):  # fmt: skip
         _refuse_filter(policy.config, policy.name)
+        _check_one_action_at_a_time(policy.config, preprocessor, ahead)
         self.policy, self.preprocessor, self.postprocessor = policy, preprocessor, postprocessor
+        self.origin = origin or Origin.of(policy.config)
         self.chunks = ChunksAhead(policy, ahead) if ahead else None
+        self._state_order: list[int] | None = None
+        self._action_order: list[int] | None = None
+        self._said_reset = False
 
     @classmethod
     def load(cls, path: str | Path, device: str = "cpu", ahead: int = 0) -> "BasePolicy":
-        """The policy of a folder, a Hub id or the name of a committed checkpoint.
+        """The policy of a folder, a Hub id or the name of a committed checkpoint; or a PEFT adapter of one, merged.
 
         Raises:
             CheckpointError: no policy there, or one that cannot be read.
-            ValueError: it is itself a filter.
+            ValueError: it is itself a filter, or cannot choose one action at a time.
         """
         folder = resolve_checkpoint(path)
         config = read_config(folder, device)
         _refuse_filter(config, path)
-        try:
-            policy = get_policy_class(config.type).from_pretrained(folder, config=config, strict=True)
-        except (SafetensorError, RuntimeError) as e:
-            raise CheckpointError(
-                f"base policy {folder}: weights unreadable or not its own ({e}); copy it again"
-            ) from e
+        policy = _load_policy(folder, config)
         preprocessor, postprocessor = make_pre_post_processors(
             config, pretrained_path=folder, preprocessor_overrides={"device_processor": {"device": device}}
         )
-        return cls(policy, preprocessor, postprocessor, ahead)
+        return cls(policy, preprocessor, postprocessor, ahead, Origin.of(config, folder))
 
     @property
     def config(self) -> PreTrainedConfig:
         """The policy's."""
         return self.policy.config
+
+    def speak(self, action_names: Sequence[str] | None, state_names: Sequence[str] | None) -> None:
+        """From now on take states, and give actions, in the order of these names, as far as the policy's are known.
+
+        Raises:
+            ValueError: the policy names other actions or states.
+        """
+        self._action_order = order(self.origin.action_names, action_names, "the base policy commands")
+        self._state_order = inverse(order(self.origin.state_names, state_names, "the base policy reads the state"))
+        if self._action_order or self._state_order:
+            logger.warning("the base policy has its numbers in another order than the filter: they are put in order")
 
     def reset(self) -> None:
         """Start an episode."""
@@ -68,8 +90,12 @@ class BasePolicy:
 
     def propose(self, observation: dict[str, Tensor]) -> Tensor:
         """Action (B, A) in robot units, through the base policy's own processors."""
+        observation = dict(observation)
+        if self._state_order is not None:
+            observation[OBS_STATE] = observation[OBS_STATE][:, self._state_order]
         act = self.policy.select_action if self.chunks is None else self.chunks.act
-        return self.postprocessor(act(self.preprocessor(dict(observation))))
+        action = self.postprocessor(act(self.preprocessor(observation)))
+        return action if self._action_order is None else action[:, self._action_order]
 
     def replan(self, executed: Tensor) -> None:
         """Drop the rest of a planned chunk: after an intervention it belongs to a state that never came.
@@ -78,19 +104,52 @@ class BasePolicy:
         (B, A) in robot units.
         """
         if hasattr(self.policy, "was_overridden"):
-            return self.policy.was_overridden(executed)
+            theirs = inverse(self._action_order)
+            return self.policy.was_overridden(executed if theirs is None else executed[:, theirs])
         if self.chunks is not None:
-            self.chunks.replan()
-        elif (queue := queued_actions(self.policy)) is not None:
-            queue.clear()
-        else:
-            self.policy.reset()
+            return self.chunks.replan()
+        if not is_lerobots(self.policy) and not self._said_reset:
+            self._said_reset = True
+            logger.warning(
+                "how the base policy (%s) forgets a plan is not known: after an override it is reset, and begins as if "
+                "the episode did. Give it a method was_overridden(executed) if it should remember",
+                self.config.type,
+            )
+        forget_plan(self.policy)
 
     def save(self, folder: Path) -> None:
-        """Write weights, config and processors to a folder."""
+        """Write weights, config, processors and what is known of its data to a folder."""
+        if self.chunks is not None:
+            self.chunks.settle()
         self.policy.save_pretrained(folder)
         self.preprocessor.save_pretrained(folder)
         self.postprocessor.save_pretrained(folder)
+        self.origin.save(folder)
+
+
+def _load_policy(folder: Path, config: PreTrainedConfig) -> PreTrainedPolicy:
+    kind = get_policy_class(config.type)
+    try:
+        if (folder / ADAPTER).exists():
+            return _load_adapted(kind, folder, config)
+        with safe_open(folder / WEIGHTS, "pt"):  # some policies of LeRobot go on with random weights
+            pass
+        return kind.from_pretrained(folder, config=config, strict=True)
+    except (SafetensorError, RuntimeError, FileNotFoundError) as e:
+        raise CheckpointError(f"base policy {folder}: weights unreadable or not its own ({e}); copy it again") from e
+    except ImportError as e:
+        raise CheckpointError(f"base policy {folder} ({config.type}) needs a package that is not here: {e}") from e
+
+
+def _load_adapted(kind: type[PreTrainedPolicy], folder: Path, config: PreTrainedConfig) -> PreTrainedPolicy:
+    """The policy that a PEFT adapter was trained on, with the adapter merged into it."""
+    adapter = json.loads((folder / ADAPTER).read_text())
+    adapted = adapter.get("base_model_name_or_path")
+    if not adapted:
+        raise CheckpointError(f"{folder / ADAPTER} names no base_model_name_or_path: write there what was adapted")
+    config.use_peft = False
+    policy = kind.from_pretrained(resolve_checkpoint(adapted, adapter.get("revision")), config=config, strict=True)
+    return merged_adapter(policy, folder)
 
 
 def _refuse_filter(config: PreTrainedConfig, path: str | Path) -> None:
@@ -98,4 +157,28 @@ def _refuse_filter(config: PreTrainedConfig, path: str | Path) -> None:
         raise ValueError(
             f"base policy {path} is itself a latentsafe filter; shields do not nest. "
             "Give --base_policy_path the policy to be shielded"
+        )
+
+
+def _check_one_action_at_a_time(config: PreTrainedConfig, preprocessor: PolicyProcessorPipeline, ahead: int) -> None:
+    """Refuse a policy that LeRobot asks for whole chunks only; warn of one whose chunks are of the state then."""
+    if getattr(getattr(config, "rtc_config", None), "enabled", False):
+        raise ValueError(
+            f"the base policy ({config.type}) has rtc_config.enabled: it then gives whole chunks only, and a filter "
+            "judges each action when it is due. Set rtc_config to null in its config.json, or shield the robot instead "
+            "(--robot.type=latentsafe_shielded)"
+        )
+    steps = getattr(preprocessor, "steps", ())
+    if not any(isinstance(step, RelativeActionsProcessorStep) and step.enabled for step in steps):
+        return
+    if config.type == "groot" or ahead:
+        raise ValueError(
+            f"the base policy ({config.type}) plans actions relative to the state at the start of a chunk. They cannot "
+            + ("be played later: give --policy.base_ahead=0" if ahead else "be chosen one at a time: shield the robot")
+        )
+    if getattr(config, "n_action_steps", 1) > 1:
+        logger.warning(
+            "the base policy's actions are relative to the state. LeRobot adds the state of the tick that an action is "
+            "played at, not of the one that it was planned at: give it n_action_steps=1, or shield the robot and run "
+            "LeRobot's --inference.type=rtc"
         )

@@ -1,13 +1,17 @@
 """Configuration of the latent safety filter as a LeRobot policy, in groups that are validated where they stand."""
 
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import NormalizationMode
 from lerobot.optim import AdamConfig, CosineDecayWithWarmupSchedulerConfig
+from lerobot.utils.constants import HF_LEROBOT_HOME
 
+from lerobot_latentsafe._compat import training_run
 from lerobot_latentsafe.critic import BACKUPS, FallbackConfig, ReachabilityConfig
+from lerobot_latentsafe.datasets.layout import check_for_lerobot
 from lerobot_latentsafe.decision import LawConfig
 from lerobot_latentsafe.margin import MarginConfig
 from lerobot_latentsafe.units import TrainedOn
@@ -93,7 +97,7 @@ class LatentSafeConfig(PreTrainedConfig):
         Raises:
             ValueError: naming the command and what there is.
         """
-        ranges = self.trained_on.ranges
+        ranges = self.trained_on.motion_ranges
         if not ranges:
             return
         unknown = [name for name in self.fallback.named_commands if name not in ranges]
@@ -135,7 +139,15 @@ class LatentSafeConfig(PreTrainedConfig):
         return None
 
     def get_optimizer_preset(self) -> AdamConfig:
-        """Adam, as lerobot-train asks for it."""
+        """Adam, as lerobot-train asks for it: the last time that it asks a policy before it opens the dataset.
+
+        Raises:
+            DatasetContractError: it would end in an error of its own there.
+        """
+        run = training_run()
+        folder = None if run is None else run.dataset.root or HF_LEROBOT_HOME / str(run.dataset.repo_id)
+        if folder is not None and (run.dataset.root or Path(folder).exists()):
+            check_for_lerobot(Path(folder), run.dataset.use_imagenet_stats)
         return AdamConfig(lr=self.optimizer_lr, weight_decay=0.0, grad_clip_norm=self.grad_clip_norm)
 
     def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
@@ -148,8 +160,6 @@ class LatentSafeConfig(PreTrainedConfig):
         )
 
     def validate_features(self) -> None:
-        """Refuse a dataset without proprioception or actions."""
-        if not self.robot_state_feature:
-            raise ValueError("latentsafe needs observation.state (proprioception); the dataset has none")
+        """Refuse a dataset without actions; one without proprioception is read by its pictures alone."""
         if not self.action_feature:
             raise ValueError("latentsafe needs an action feature; the dataset has none")

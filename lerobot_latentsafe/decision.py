@@ -27,6 +27,7 @@ class Reason(IntEnum):
     BASE_POLICY_FAILED = 9
     NO_BASE_POLICY = 10
     WRONG_RATE = 11
+    OBSERVATION_OUT_OF_RANGE = 12
 
 
 @dataclass
@@ -144,13 +145,14 @@ class FilterDecision:
     """One decision for each row of a batch; actions in robot units.
 
     Attributes:
-        action: (B, A), what to execute.
+        action: (B, A), what to execute: the proposal, clipped into the data's range, or the fallback.
         proposed: (B, A), what the base policy wanted.
         value: (B,), V of the latent predicted under the proposed action.
         margin: (B,), l of the current latent; negative means it looks like a failure already.
         unsafe: bool (B,), the law's verdict on the proposed action.
         intervened: bool (B,), whether `action` is the fallback's; never in monitor mode.
         reason: int64 (B,), a `Reason`.
+        heard: (B, A), the action that was judged, as the world model heard it; of faulty rows that is to stay.
     """
 
     action: Tensor
@@ -160,6 +162,7 @@ class FilterDecision:
     unsafe: Tensor
     intervened: Tensor
     reason: Tensor
+    heard: Tensor | None = None
 
 
 def least_restrictive(
@@ -170,6 +173,7 @@ def least_restrictive(
     epsilon: float | Tensor,
     fault: Tensor | None = None,
     monitor: bool = False,
+    passing: Tensor | None = None,
 ) -> FilterDecision:
     """The paper's law: pass the proposed action if V > epsilon at its predicted next latent, else fall back.
 
@@ -180,6 +184,7 @@ def least_restrictive(
         epsilon: threshold, or one for each row (B,).
         fault: (B,) a `Reason` for rows that must not pass whatever their value; 0 elsewhere.
         monitor: judge, but let every action through.
+        passing: (B, A), what of the proposal is executed if it passes; by default all.
     """
     reason = torch.where(value > epsilon, Reason.PASSED, Reason.UNSAFE_VALUE)
     reason = torch.where(torch.isfinite(value), reason, Reason.VALUE_NOT_FINITE)
@@ -187,7 +192,8 @@ def least_restrictive(
         reason = torch.where(fault != Reason.PASSED, fault, reason)
     unsafe = reason != Reason.PASSED
     intervened = torch.zeros_like(unsafe) if monitor else unsafe
-    action = torch.where(intervened[:, None], fallback, proposed)
+    passing = proposed if monitor or passing is None else passing
+    action = torch.where(intervened[:, None], fallback, passing)
     return FilterDecision(action, proposed, value, margin, unsafe, intervened, reason)
 
 

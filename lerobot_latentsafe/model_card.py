@@ -8,6 +8,8 @@ from huggingface_hub import ModelCard, ModelCardData
 
 from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
 from lerobot_latentsafe.decision import LAWS, RECENT, LawConfig
+from lerobot_latentsafe.meanings import Command
+from lerobot_latentsafe.units import TrainedOn
 
 TEXT = """---
 {header}
@@ -137,9 +139,19 @@ def _robot(config: LatentSafeConfig) -> dict[str, str]:
         "robot": f"`{trained_on.robot_type}`" if trained_on.robot_type else "unknown",
         "cameras": ", ".join(f"`{c}` {tuple(config.input_features[c].shape)}" for c in trained_on.cameras or []),
         "fps": str(trained_on.fps),
-        "actions": ", ".join(f"{name} in [{low:g}, {high:g}]" for name, (low, high) in trained_on.ranges.items()),
+        "actions": ", ".join(_command(c, trained_on) for c in trained_on.commands),
         "states": ", ".join(trained_on.state_names or []),
     }
+
+
+def _command(command: Command, trained_on: TrainedOn) -> str:
+    """What a command means and how far it went in the data, in words."""
+    (low, high), moves = trained_on.ranges[command.name], trained_on.motion_ranges[command.name]
+    text = f"{command.name} in [{low:g}, {high:g}]"
+    if trained_on.meanings is None:
+        return text
+    text += f" ({command.described}"
+    return f"{text}, at most {moves[0]:+.3g} to {moves[1]:+.3g} from the state)" if command.of_state else f"{text})"
 
 
 def threshold(law: LawConfig) -> str:

@@ -11,12 +11,15 @@ from typing import Any
 import torch
 from huggingface_hub import ModelCard
 from lerobot.configs.types import FeatureType, PolicyFeature
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
 from lerobot_latentsafe._compat import NOT_AVERAGED
 from lerobot_latentsafe.base_policy import BasePolicy
 from lerobot_latentsafe.configuration_latentsafe import SEALED, LatentSafeConfig
+from lerobot_latentsafe.datasets.adoption import adopt_dataset, check_candidates
 from lerobot_latentsafe.datasets.clips import FilterData
 from lerobot_latentsafe.decision import FilterDecision, LawOptions, Reason
 from lerobot_latentsafe.model_card import make_model_card
@@ -31,7 +34,6 @@ from lerobot_latentsafe.runtime.checkpoint import (
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
 from lerobot_latentsafe.safety_model import SafetyModel, UntrainedFilterError
 from lerobot_latentsafe.shield import Shield
-from lerobot_latentsafe.units import adopt_dataset, check_candidates
 
 logger = logging.getLogger(__name__)
 
@@ -62,13 +64,14 @@ class LatentSafePolicy(PreTrainedPolicy):
         super().__init__(config)
         data = None
         if dataset_meta is not None:
-            data = adopt(config, dataset_meta, dataset_stats or dataset_meta.stats)
+            data = adopt(config, dataset_meta)
         self.model = model or SafetyModel(config)
         config.validate_features()
         self.reader = None if data is None else data.reader(config.world_model.clip_length, self.model.units)
         if data is not None and data.cache is not None:
             self.model.world_model.load_basis(Path(data.frame_cache))
         setattr(self, NOT_AVERAGED, self._never_averaged())
+        self._told_untrained = False
         self._base: list[BasePolicy] = []  # in a list, so that its weights are not ours
         self.shield = Shield(self.model)
         if config.base_policy_path:
@@ -97,7 +100,8 @@ class LatentSafePolicy(PreTrainedPolicy):
             )
         if self.model.device.type == "cpu":
             keep_freed_memory()
-        loss, _, metrics = self.model.clip_loss(self.reader.read(batch, self.model))
+        with self.model.single_precision():
+            loss, _, metrics = self.model.clip_loss(self.reader.read(batch, self.model))
         return loss, {name: torch.as_tensor(value).item() for name, value in metrics.items()}
 
     # -- deployment ---
@@ -111,12 +115,13 @@ class LatentSafePolicy(PreTrainedPolicy):
         """Shield a policy: an object, or that of a folder, a Hub id or a committed name.
 
         Raises:
-            ValueError: it acts in another action space, or at another rate.
+            ValueError: it acts in another action space, reads another state, or acts at another rate.
         """
         path = getattr(base.config, "pretrained_path", None) if isinstance(base, BasePolicy) else base
         if not isinstance(base, BasePolicy):
             base = BasePolicy.load(base, self.config.device, self.config.base_ahead)
         self._check_base(base, path)
+        base.speak(self.config.trained_on.action_names, self.config.trained_on.state_names)
         features = {**base.config.input_features, **self.config.input_features}
         self.config.change(input_features=features, base_policy_path=str(path or "base policy"))
         self._base = [base]
@@ -129,8 +134,8 @@ class LatentSafePolicy(PreTrainedPolicy):
                 f"base policy {path} acts in {getattr(theirs, 'shape', None)}, the filter in {own.shape} "
                 f"({', '.join(trained_on.action_names or [])}); they must share one action space"
             )
-        for name in ("task", "fps", "action_names"):  # a policy with a world model says what that is of
-            known, wanted = getattr(trained_on, name), getattr(base.config, name, None)
+        task = getattr(base.config, "task", None)  # a policy with a world model says what that is of
+        for name, known, wanted in (("task", trained_on.task, task), ("fps", trained_on.fps, base.origin.fps)):
             if known is not None and wanted is not None and known != wanted:
                 raise ValueError(f"base policy {path} has {name} = {wanted}, the filter {known}; they must agree")
 
@@ -143,14 +148,27 @@ class LatentSafePolicy(PreTrainedPolicy):
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """The shielded base action, or the fallback's action if there is no base policy: (B, A) in robot units."""
+        if self.reader is not None and not self.model.is_trained_for_law():
+            return self._stand_still(batch)
         return self.decide(batch).action
+
+    def _stand_still(self, batch: dict[str, Tensor]) -> Tensor:
+        """No motion (B, A): what lerobot-train's `--env.type` evaluates while there is no critic yet."""
+        if not self._told_untrained:
+            self._told_untrained = True
+            logger.warning(
+                "lerobot-train evaluates a filter whose safety critic is not trained yet: the robot stands still, and "
+                "the success rate says nothing. Leave out --env.type, or give --env_eval_freq=0; train the critic with "
+                "latentsafe train-reachability, then measure with latentsafe eval-shield"
+            )
+        return self.model.units.hold_action(len(batch[OBS_STATE]))
 
     @torch.no_grad()
     def decide(self, batch: dict[str, Tensor], age_s: float = 0.0) -> FilterDecision:
         """Like `select_action`, with the whole decision."""
         self.model.require_trained_for_law()
         if self.base is None:
-            return self.shield(batch, None, age_s, missing_reason=Reason.NO_BASE_POLICY)
+            return self._judge(batch, None, age_s, missing_reason=Reason.NO_BASE_POLICY)
         try:
             proposed = self.base.propose(batch)
         except Exception:
@@ -158,14 +176,28 @@ class LatentSafePolicy(PreTrainedPolicy):
                 raise
             logger.exception("base policy failed; the fallback acts")
             proposed = None
-        decision = self.shield(batch, proposed, age_s)
+        decision = self._judge(batch, proposed, age_s)
         if decision.intervened.any():
             self.base.replan(decision.action)
         return decision
 
+    @torch.compiler.disable
+    def _judge(self, *given: Any, **options: Any) -> FilterDecision:
+        """The shield's decision, in single precision under autocast and uncompiled: the same wherever it is made."""
+        with self.model.single_precision():
+            return self.shield(*given, **options)
+
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """A chunk of one: (B, 1, A). A longer one would be filtered on stale observations."""
         return self.select_action(batch).unsqueeze(1)
+
+    def supports_rtc(self) -> bool:
+        """No: a chunk is decided on one observation, and a filter must see what every action of it leads to."""
+        logger.error(
+            "a shielded policy judges one action a tick, and real-time chunking asks for whole chunks. Run the bare "
+            "policy with --inference.type=rtc on a shielded robot (--robot.type=latentsafe_shielded)"
+        )
+        return False
 
     # -- files ---
 
@@ -236,28 +268,35 @@ def load_filter(
     return policy
 
 
-def adopt(config: LatentSafeConfig, meta: Any, stats: dict) -> FilterData:
+def adopt(config: LatentSafeConfig, meta: LeRobotDatasetMetadata) -> FilterData:
     """Open a dataset for a filter, and take over what it tells: units, ranges, cameras, cache.
 
     Raises:
         UnlabelledDatasetError: no failure labels.
         FrameCacheError: a torn cache, or one of another dataset, image size or encoder.
+        MeaningError: what a command means cannot be told.
         ValueError: another robot, rate, range or camera than those trained on.
     """
     data = FilterData.open(
         meta, config.margin.failure_specification, config.frame_cache, config.world_model.image_size,
         config.trained_on.cameras,
     )  # fmt: skip
-    data.check_cameras({key: config.input_features[key].shape for key in data.cameras if key in config.input_features})
-    trained_on = adopt_dataset(config.trained_on, meta, stats)
+    if config.trained_on.action_low is not None:  # else LeRobot has just read the shapes from the same dataset
+        data.check_cameras({key: config.input_features[key].shape for key in data.cameras})
+    trained_on = adopt_dataset(config.trained_on, data.contract)
     trained_on.cameras = list(data.cameras)
     check_candidates(config.fallback.action_candidates, trained_on, meta.repo_id)
-    pictures = {key: PolicyFeature(FeatureType.VISUAL, shape) for key, shape in data.cameras.items()}
+    features = {key: feature for key, feature in config.input_features.items() if key not in data.contract.left_out}
+    features |= {key: PolicyFeature(FeatureType.VISUAL, shape) for key, shape in data.cameras.items()}
+    if data.contract.state_names:
+        features[OBS_STATE] = PolicyFeature(FeatureType.STATE, (len(data.contract.state_names),))
+    actions = {ACTION: PolicyFeature(FeatureType.ACTION, (len(data.contract.action_names),))}
     world_model = config.world_model
     config.change(
         trained_on=trained_on,
         world_model=world_model if data.cache is None else world_model.of_cache(data.cache.manifest),
         frame_cache=data.frame_cache,
-        input_features={**config.input_features, **pictures},
+        input_features=features,
+        output_features={**config.output_features, **actions},
     )
     return data

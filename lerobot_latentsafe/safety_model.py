@@ -3,6 +3,10 @@
 The shield, the evaluation, the task policy that learns in imagination and the LeRobot policy share it.
 """
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
@@ -64,6 +68,7 @@ class SafetyModel(nn.Module):
     Attributes:
         units: normalises and denormalises.
         world_model, margin, critic: the parts.
+        has_fresh_weights: whether nothing was loaded or trained yet, whatever the configuration says of its weights.
 
     Raises:
         UntrainedFilterError: nothing says what actions and states look like.
@@ -84,6 +89,22 @@ class SafetyModel(nn.Module):
         config.change(world_model=self.world_model.config)
         self.margin = self.new_margin()
         self.critic = self.new_critic()
+        self.has_fresh_weights = True
+        self.register_load_state_dict_post_hook(_has_loaded)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "SafetyModel":
+        """What torch does at `.to(...)`: another device is fine, another precision is not what was measured.
+
+        Raises:
+            TypeError: naming the precision.
+        """
+        asked = fn(torch.zeros(1)).dtype
+        if asked != torch.float32:
+            raise TypeError(
+                f"a latentsafe filter decides in single precision (torch.float32), and was to become {asked}. Leave "
+                "the dtype out; a base policy may have its own (`policy.base.policy.to(...)`)"
+            )
+        return super()._apply(fn, recurse)
 
     def new_margin(self) -> FailureMargin:
         """A margin with fresh weights."""
@@ -95,7 +116,7 @@ class SafetyModel(nn.Module):
         units, fallback, candidates = self.units, self.config.fallback, None
         if fallback.action_candidates is not None:
             robots = torch.tensor(fallback.action_candidates, dtype=torch.float32, device=units.device)
-            candidates = units.normalise_action(robots)
+            candidates = units.normalise_motions(robots)
         bounds = fallback.bounds(units.action_names, units.action_varies & ~units.frozen)
         sizes = self.world_model.feature_dim, len(units.action_low), candidates, self.config.reachability
         return SafetyCritic(*sizes, *bounds, self.config.trained_on.target).to(self.device)
@@ -104,6 +125,10 @@ class SafetyModel(nn.Module):
     def device(self) -> torch.device:
         """Where the weights lie."""
         return self.units.device
+
+    def single_precision(self) -> AbstractContextManager:
+        """Meanwhile torch computes in single precision, also where a caller asked for mixed precision (autocast)."""
+        return torch.autocast(self.device.type, enabled=False)
 
     @property
     def imagination(self) -> LatentImagination:
@@ -139,7 +164,7 @@ class SafetyModel(nn.Module):
         or what `law.name` says instead.
         """
         self.require_trained_for_law()
-        law, still = self.config.law, self.units.normalise_action(self.units.hold_action(1))
+        law, still = self.config.law, self.units.still
         if law.name == "margin":
             margin = self.imagination.margin(latent)
             return margin, self.imagination.complete(latent, still.expand(len(margin), -1))
@@ -150,9 +175,17 @@ class SafetyModel(nn.Module):
         """The value of going through a margin l to a latent of some value, all (...,): Eq. 5 undiscounted."""
         return BACKUPS.get(self.config.law.name, safety_bellman_target)(margin, value, 1.0)
 
+    @property
+    def _stage_of_law(self) -> str:
+        return "critic" if self.config.law.name in BACKUPS else "world_model"
+
+    def is_trained_for_law(self) -> bool:
+        """Whether training has come far enough for the law to decide."""
+        return self.config.trained_on.has_reached(self._stage_of_law)
+
     def require_trained_for_law(self) -> None:
         """Raise unless training has come far enough for the law to decide."""
-        self.require_stage("critic" if self.config.law.name in BACKUPS else "world_model")
+        self.require_stage(self._stage_of_law)
 
     def require_stage(self, stage: str) -> None:
         """Raise unless training has come at least this far, and the critic says what the law reads.
@@ -172,6 +205,12 @@ class SafetyModel(nn.Module):
                 f"this filter's stage is {trained_on.stage!r}, {stage!r} is needed: its {part} was never "
                 f"trained. Run {command} first"
             )
+        if self.has_fresh_weights:
+            raise UntrainedFilterError(
+                "this filter has random weights: its configuration was read, its weights were not. Load both with "
+                "LatentSafePolicy.from_pretrained(folder), or set config.pretrained_path to the folder before "
+                "LeRobot's make_policy"
+            )
 
     # -- learning ---
 
@@ -186,4 +225,9 @@ class SafetyModel(nn.Module):
         correct = (((margin < 0) == (failure == 1)) & labelled).sum() / labelled.sum()
         if self.training:  # a critic of the world model before knows nothing of this one
             self.config.trained_on.stage = "world_model"
+            self.has_fresh_weights = False
         return loss, features, {**metrics, "loss_margin": margin_loss, "margin_accuracy": correct}
+
+
+def _has_loaded(model: SafetyModel, incompatible: Any) -> None:
+    model.has_fresh_weights = False

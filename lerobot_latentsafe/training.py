@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from tqdm import trange
 
 from lerobot_latentsafe.critic import BACKUPS
+from lerobot_latentsafe.datasets.adoption import adopt_dataset
 from lerobot_latentsafe.datasets.clips import ClipReader, FilterData
 from lerobot_latentsafe.latent import Latent, map_latent, select
 from lerobot_latentsafe.margin import FailureMargin, hinge_loss
@@ -21,7 +22,6 @@ from lerobot_latentsafe.runtime.files import refuse_existing
 from lerobot_latentsafe.runtime.hub import save_policy
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
 from lerobot_latentsafe.safety_model import SafetyModel
-from lerobot_latentsafe.units import adopt_dataset
 
 STARTS_BYTES = 2**30
 """Memory for the latents that imagination starts from; those of a transformer hold keys and values and are large."""
@@ -123,10 +123,10 @@ def load_with_cache(path: str | Path, dataset_meta, seed: int = 0) -> tuple[Late
     policy = load_filter(path)
     config, trained_on = policy.config, policy.config.trained_on
     policy.model.require_stage("world_model")
-    adopt_dataset(trained_on, dataset_meta, dataset_meta.stats)
     # The cache of the first stage may be gone; the dataset brings its own.
     specification, size = config.margin.failure_specification, config.world_model.image_size
     data = FilterData.open(dataset_meta, specification, None, size, trained_on.cameras)
+    adopt_dataset(trained_on, data.contract)
     data.check_cameras({key: config.input_features[key].shape for key in data.cameras})
     reader = data.reader(config.world_model.clip_length, policy.model.units)
     reader.require_cache()
@@ -177,8 +177,9 @@ def encoded_starts(
 
 
 def covered_actions(model: SafetyModel, reader: ClipReader, coverage: float) -> tuple[list[float], list[float]]:
-    """Range of each command, in [-1, 1], that holds all but a share `coverage` of the data at either end, and zero."""
-    action = model.units.normalise_action(torch.from_numpy(np.array(reader.cache.action)).to(model.device))
+    """Range of each motion, in [-1, 1], that holds all but a share `coverage` of the data at either end, and zero."""
+    columns = (reader.cache.action, reader.cache.state)
+    action = model.units.normalise_action(*(torch.from_numpy(np.array(c)).to(model.device) for c in columns))
     ends = torch.tensor([coverage, 1 - coverage], device=action.device)
     low, high = torch.quantile(
         action[torch.linspace(0, len(action) - 1, min(len(action), 100_000)).long()], ends, dim=0

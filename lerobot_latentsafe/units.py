@@ -1,19 +1,28 @@
 """Units and ranges: what a dataset tells a filter of its robot, and how numbers go in and out of the models.
 
-Robot units at the border; inside, actions in [-1, 1] by the dataset's range and states in standard deviations.
+Robot units at the border; inside, motions in about [-1, 1] by what the data show, and states in standard deviations.
+A motion is a command that is zero, or as it was, where nothing moves: a delta, a velocity, a switch, and of a target
+its displacement, the target minus the present state. So targets are converted where the state is known: here.
 """
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor, nn
 
+from lerobot_latentsafe.meanings import Command, parse
+
 STAGES = ("untrained", "world_model", "critic")
-CONSTANT_BAND = 0.05
-"""Relative half-width of the range of a command that never varies in the data."""
-RANGE_SLACK = 0.25
-"""Share of the range trained on by which another dataset's actions may exceed it."""
+RANGE_TOLERANCE = 0.1
+"""Share of the data's range by which a command may leave it: it is clipped, and judged and executed as clipped."""
+STATE_TOLERANCE = 1.0
+"""Share of the data's range by which a number of the state may leave it and still be believed."""
+STEP_TOLERANCE, MISSED_TICKS = 3.0, 3
+"""A number of the state that changes by more than so many of the data's largest steps since it was read last is not
+believed; if it could not be read meanwhile, so many ticks count at most."""
+LOUDEST = 4.0
+"""Inside, a displacement of the 99th percentile is 1; the rare larger ones are heard as this at most."""
 
 
 @dataclass
@@ -28,10 +37,15 @@ class TrainedOn:
         robot_type: LeRobot's name of the robot that recorded the dataset.
         fps: frames a second.
         state_names, action_names: of the numbers of `observation.state` and `action`, in order.
+        meanings: command -> target, delta, velocity or other (see `meanings.py`). Training fills in what names and data
+            tell; give those that they do not tell. Filters of versions before 0.3 have none, and no targets.
         action_low, action_high: least and largest command of the data.
         action_varies: False for commands that the data never vary; the filter keeps those and knows nothing else of
             them.
-        state_mean, state_std: of the data.
+        displacement_low, displacement_high: least and largest displacement of each target, its 99th percentile in
+            size is displacement_scale; 0, 0 and 1 for commands that are no targets.
+        state_low, state_high, state_mean, state_std: of the data.
+        state_step: by how much each number of the state changes from frame to frame at most.
     """
 
     stage: str = "untrained"
@@ -39,169 +53,230 @@ class TrainedOn:
     task: str | None = None
     cameras: list[str] | None = None
     robot_type: str | None = None
-    fps: int | None = None
+    fps: float | None = None
     state_names: list[str] | None = None
     action_names: list[str] | None = None
+    meanings: dict[str, str] | None = None
     action_low: list[float] | None = None
     action_high: list[float] | None = None
     action_varies: list[bool] | None = None
+    displacement_low: list[float] | None = None
+    displacement_high: list[float] | None = None
+    displacement_scale: list[float] | None = None
+    state_low: list[float] | None = None
+    state_high: list[float] | None = None
+    state_step: list[float] | None = None
     state_mean: list[float] | None = None
     state_std: list[float] | None = None
 
     def __post_init__(self) -> None:
         if self.stage not in STAGES:
             raise ValueError(f"stage is {self.stage!r}; expected one of {', '.join(STAGES)}")
+        if self.fps is not None and self.fps == round(self.fps):
+            self.fps = round(self.fps)  # 15, not 15.0, wherever people read it
 
     def has_reached(self, stage: str) -> bool:
         """Whether training has come at least this far."""
         return STAGES.index(self.stage) >= STAGES.index(stage)
 
     @property
+    def commands(self) -> list[Command]:
+        """Each command with its meaning; filters of versions before 0.3 call all of them deltas."""
+        given, states = self.meanings or {}, self.state_names or []
+        return [parse(name, given.get(name, "delta"), states) for name in self.action_names or []]
+
+    @property
     def ranges(self) -> dict[str, tuple[float, float]]:
         """Command -> least and largest value in the data; empty before training."""
         return dict(zip(self.action_names or [], zip(self.action_low or [], self.action_high or [])))
+
+    @property
+    def motion_ranges(self) -> dict[str, tuple[float, float]]:
+        """Command -> least and largest motion in the data: of a target, its displacement."""
+        if self.displacement_low is None:
+            return self.ranges
+        moves = dict(zip(self.action_names, zip(self.displacement_low, self.displacement_high)))
+        return self.ranges | {c.name: moves[c.name] for c in self.commands if c.meaning == "target"}
 
 
 class Units(nn.Module):
     """Numbers of a robot to numbers of the models, and back.
 
     Args:
-        trained_on: names, ranges, means and deviations.
-        frozen_commands: commands that a fallback never changes, such as `gripper.pos`.
+        trained_on: names, meanings, ranges, means and deviations.
+        frozen_commands: commands that a fallback never changes, such as `gripper.pos`; switches are frozen, too.
     """
 
     action_low: Tensor
     action_high: Tensor
     action_varies: Tensor
+    displacement_low: Tensor
+    displacement_high: Tensor
+    displacement_scale: Tensor
+    state_low: Tensor
+    state_high: Tensor
+    state_step: Tensor
     state_mean: Tensor
     state_std: Tensor
     frozen: Tensor
+    stays: Tensor
+    is_target: Tensor
 
     def __init__(self, trained_on: TrainedOn, frozen_commands: list[str]):
         super().__init__()
         self.action_names, self.state_names = trained_on.action_names or [], trained_on.state_names or []
-        for name in ("action_low", "action_high", "state_mean", "state_std"):
-            number = torch.tensor(getattr(trained_on, name), dtype=torch.float32)
+        n_actions, n_states = len(trained_on.action_low), len(trained_on.state_mean)
+        unknown = {
+            "displacement_low": [0.0] * n_actions, "displacement_high": [0.0] * n_actions,
+            "displacement_scale": [1.0] * n_actions, "state_low": [-torch.inf] * n_states,
+            "state_high": [torch.inf] * n_states, "state_step": [torch.inf] * n_states,
+        }  # fmt: skip
+        for name in ("action_low", "action_high", "state_mean", "state_std", *unknown):
+            known = getattr(trained_on, name)
+            number = torch.tensor(unknown[name] if known is None else known, dtype=torch.float32)
             self.register_buffer(name, number, persistent=False)
-        self.register_buffer("action_varies", torch.tensor(trained_on.action_varies), persistent=False)
-        frozen = torch.tensor([name in frozen_commands for name in self.action_names])
+        varies = torch.tensor(trained_on.action_varies)
+        commands = trained_on.commands
+        self.register_buffer("action_varies", varies, persistent=False)
+        self.register_buffer("is_target", torch.tensor([c.meaning == "target" for c in commands]), persistent=False)
+        frozen = torch.tensor([c.name in frozen_commands or c.meaning == "other" for c in commands])
         self.register_buffer("frozen", frozen, persistent=False)
+        self.register_buffer("stays", frozen & (trained_on.meanings is not None), persistent=False)
+        shown_by = [c.of_state or c.name for c in commands]
+        places = [self.state_names.index(name) if name in self.state_names else -1 for name in shown_by]
+        self.register_buffer("_shown_by", torch.tensor(places), persistent=False)
 
     @property
     def device(self) -> torch.device:
         """Where the numbers lie."""
         return self.action_low.device
 
-    def normalise_action(self, action: Tensor) -> Tensor:
-        """Robot units -> [-1, 1] by the dataset's range: (..., A)."""
-        return 2 * (action - self.action_low) / (self.action_high - self.action_low) - 1
+    @cached_property
+    def has_targets(self) -> bool:
+        """Whether any command is a target, so that actions mean nothing without the state."""
+        return bool(self.is_target.any())
 
-    def denormalise_action(self, action: Tensor) -> Tensor:
-        """[-1, 1] -> robot units: (..., A)."""
-        return self.action_low + (action + 1) / 2 * (self.action_high - self.action_low)
+    # -- actions in and out ---
 
-    def normalise_state(self, state: Tensor) -> Tensor:
-        """Robot units -> standard deviations from the mean: (..., S)."""
-        return (state.float() - self.state_mean) / self.state_std
+    def normalise_action(self, action: Tensor, state: Tensor | None = None) -> Tensor:
+        """Robot units -> motions, about [-1, 1] by what the data show: (..., A).
+
+        Args:
+            state: (..., S) in robot units, at which the action was chosen; needed where commands are targets.
+        """
+        low, high = self._motion_range
+        return 2 * (action - self._origin(state) - low) / (high - low) - 1
+
+    def denormalise_action(self, action: Tensor, state: Tensor | None = None) -> Tensor:
+        """Motions -> robot units: (..., A); the inverse of `normalise_action`."""
+        low, high = self._motion_range
+        return self._origin(state) + low + (action + 1) / 2 * (high - low)
+
+    def heard_action(self, action: Tensor, state: Tensor | None = None) -> Tensor:
+        """Robot units -> motions as the world model hears them: bounded (..., A)."""
+        motion, loudest = self.normalise_action(action, state), torch.where(self.is_target, LOUDEST, 1.0)
+        return motion.clamp(-loudest, loudest)
+
+    def normalise_motions(self, motion: Tensor) -> Tensor:
+        """Motions in robot units, of targets displacements, -> about [-1, 1]: (..., A)."""
+        low, high = self._motion_range
+        return 2 * (motion - low) / (high - low) - 1
+
+    @property
+    def _motion_range(self) -> tuple[Tensor, Tensor]:
+        """What is -1 and 1 inside, in robot units: (A,) each."""
+        if not self.has_targets:
+            return self.action_low, self.action_high
+        low = torch.where(self.is_target, -self.displacement_scale, self.action_low)
+        return low, torch.where(self.is_target, self.displacement_scale, self.action_high)
+
+    def _origin(self, state: Tensor | None) -> Tensor | float:
+        """What motions count from: the present state of targets, zero of other commands: (..., A)."""
+        if not self.has_targets:
+            return 0.0
+        if state is None:
+            raise ValueError("some commands are targets, which mean nothing without the state; give state=")
+        return torch.where(self.is_target, self.seen(state), 0.0)
+
+    def seen(self, state: Tensor) -> Tensor:
+        """What the state (..., S), in robot units, shows of each command: (..., A); NaN where it shows nothing."""
+        if not len(self.state_names):
+            return state.new_full((*state.shape[:-1], len(self.action_low)), torch.nan)
+        return torch.where(self._shown_by >= 0, state[..., self._shown_by.clamp(min=0)], torch.nan)
 
     def first_action(self, action: Tensor) -> Tensor:
         """What counts as having led to the first frame of an episode: no motion, frozen commands as in `action`."""
         return torch.where(self.frozen, action, 0.0)
 
-    def hold_action(self, batch_size: int) -> Tensor:
-        """What to do when nothing can be known: zero motion, or the nearest the range allows: (B, A) in robot units."""
-        middle = (self.action_low + self.action_high) / 2
-        still = torch.zeros_like(middle).clamp(self.action_low, self.action_high)
-        return torch.where(self.action_varies, still, middle).repeat(batch_size, 1)
+    # -- in range ---
 
-    def commands_seen(self, state: Tensor) -> Tensor:
-        """What a normalised state (B, S) tells of commands of the same name, such as `gripper.pos`.
+    def clip(self, action: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """An action in the data's range, in robot units (B, A), and which rows left it by more than the tolerance (B,).
+
+        A target also keeps to the displacements that the data show: a larger one is a jump.
+        """
+        margin = RANGE_TOLERANCE * (self.action_high - self.action_low)
+        far = (action < self.action_low - margin) | (action > self.action_high + margin)
+        low, high = self.action_low, self.action_high
+        if self.has_targets:
+            pose, margin = self.seen(state), RANGE_TOLERANCE * (self.displacement_high - self.displacement_low)
+            nearest, furthest = pose + self.displacement_low, pose + self.displacement_high
+            far |= self.is_target & ((action < nearest - margin) | (action > furthest + margin))
+            # A robot that stands beyond the range of the targets may stay there.
+            low = torch.where(self.is_target, torch.maximum(torch.minimum(low, pose), nearest), low)
+            high = torch.where(self.is_target, torch.minimum(torch.maximum(high, pose), furthest), high)
+        return torch.minimum(torch.maximum(action, low), high), far.any(-1)
+
+    def hold(self, state: Tensor, told: Tensor | None = None) -> Tensor:
+        """What to do when nothing can be known: stay (B, A), in robot units.
+
+        A target stays what was commanded last, if the robot is near it, so that an arm does not sink under its weight
+        and a gripper keeps its grip; else it is what is seen. A delta or velocity is zero, or the nearest the range
+        allows. Frozen commands stay as they were, or as seen.
+
+        Args:
+            state: (B, S); numbers that are not usable are NaN.
+            told: (B, A), what was commanded last.
 
         Returns:
-            (B, A) in robot units, in range; NaN for commands that the state does not tell.
+            NaN for targets of which nothing is known.
         """
-        seen = state.new_full((len(state), len(self.action_low)), torch.nan)
-        for i, name in enumerate(self.action_names):
-            if name in self.state_names:
-                j = self.state_names.index(name)
-                seen[:, i] = state[:, j] * self.state_std[j] + self.state_mean[j]
-        return seen.clamp(self.action_low, self.action_high)
+        seen = self.seen(state)
+        told = torch.full_like(seen, torch.nan) if told is None else told
+        still = torch.zeros_like(self.action_low).clamp(self.action_low, self.action_high)
+        still = torch.where(self.action_varies, still, (self.action_low + self.action_high) / 2)
+        kept = torch.where(told.isfinite(), told, seen).clamp(self.action_low, self.action_high)
+        far = (told - seen).abs() > self.displacement_scale
+        pose = torch.where(told.isnan() | far, seen, told)
+        return torch.where(
+            self.is_target, pose, torch.where(self.frozen & kept.isfinite(), kept, still.expand_as(kept))
+        )
 
+    @property
+    def still(self) -> Tensor:
+        """Standing still, inside: (1, A)."""
+        unknown = torch.full((1, len(self.state_mean)), torch.nan, device=self.device)
+        return self.normalise_motions(torch.where(self.is_target, 0.0, self.hold(unknown)))
 
-def adopt_dataset(known: TrainedOn, meta: Any, stats: dict) -> TrainedOn:
-    """What is known with what a dataset tells beyond it.
+    # -- states ---
 
-    Args:
-        known: what a filter was trained on, or nothing yet.
-        meta: LeRobotDatasetMetadata, or what has its repo_id, robot_type, fps and features.
-        stats: its statistics: feature -> min, max, mean, std.
+    def normalise_state(self, state: Tensor) -> Tensor:
+        """Robot units -> standard deviations from the mean: (..., S)."""
+        return (state.float() - self.state_mean) / self.state_std
 
-    Raises:
-        ValueError: the dataset is of another robot or rate, its actions never change, or leave the range trained on.
-    """
-    action, state = meta.features["action"], meta.features["observation.state"]
-    found: dict[str, Any] = {
-        "fps": int(meta.fps),
-        "action_names": list(action["names"] or []),
-        "state_names": list(state["names"] or []),
-    }
-    for name, value in found.items():
-        trained = getattr(known, name)
-        if trained is not None and trained != value:
-            raise ValueError(
-                f"{meta.repo_id} has {name} = {value}, this filter was trained with {trained}; "
-                "train a new filter or use a dataset recorded with the same robot and rate"
-            )
-    adopted = replace(known, **found, robot_type=known.robot_type or meta.robot_type)
-    low, high = _list(stats["action"]["min"]), _list(stats["action"]["max"])
-    if known.action_low is None:
-        state_std = [max(s, 1e-3) for s in _list(stats["observation.state"]["std"])]
-        state_mean = _list(stats["observation.state"]["mean"])
-        adopted = replace(_with_ranges(adopted, meta.repo_id, low, high), state_mean=state_mean, state_std=state_std)
-    _check_range(adopted, meta.repo_id, low, high)
-    return adopted
+    def believable(self, state: Tensor, pose: Tensor, missed: Tensor) -> Tensor:
+        """Numbers of a state (B, S) that a robot like that of the data can show, after what it showed before.
 
+        Args:
+            pose: (B, S), each number as it was read last; NaN before that.
+            missed: (B, S), ticks since then in which it could not be read.
 
-def _with_ranges(trained_on: TrainedOn, repo_id: str, low: list[float], high: list[float]) -> TrainedOn:
-    """With ranges of commands; one that never varies gets a band around it, so that float noise is not out of range."""
-    varies = [h - l > 1e-6 for l, h in zip(low, high)]
-    if not any(varies):
-        raise ValueError(f"the actions of {repo_id} never change: {low}; record episodes that move")
-    band = [0.0 if v else CONSTANT_BAND * max(abs(l), 1.0) for v, l in zip(varies, low)]
-    return replace(
-        trained_on,
-        action_varies=varies,
-        action_low=[l - b for l, b in zip(low, band)],
-        action_high=[h + b for h, b in zip(high, band)],
-    )
-
-
-def _check_range(trained_on: TrainedOn, repo_id: str, low: list[float], high: list[float]) -> None:
-    """Refuse actions far outside of the range that the filter was trained on: they would be clipped, unseen."""
-    for (name, (trained_low, trained_high)), l, h in zip(trained_on.ranges.items(), low, high):
-        slack = RANGE_SLACK * (trained_high - trained_low)
-        if l < trained_low - slack or h > trained_high + slack:
-            raise ValueError(
-                f"{name} of {repo_id} reaches from {l:g} to {h:g}, this filter was trained on {trained_low:g} to "
-                f"{trained_high:g}: another unit, or another robot? Convert the actions, or train a new filter"
-            )
-
-
-def check_candidates(candidates: list[list[float]] | None, trained_on: TrainedOn, repo_id: str) -> None:
-    """Refuse a discrete action set (K, A) that leaves the range of a dataset.
-
-    Raises:
-        ValueError: naming the candidate and the range.
-    """
-    for candidate in candidates or []:
-        bounds = list(zip(trained_on.action_low, candidate, trained_on.action_high))
-        inside = all(low - 1e-4 <= a <= high + 1e-4 for low, a, high in bounds)
-        if len(candidate) != len(trained_on.action_low) or not inside:
-            raise ValueError(
-                f"action candidate {candidate} is outside of what {repo_id} covers: "
-                f"{trained_on.action_low} to {trained_on.action_high}"
-            )
-
-
-def _list(values) -> list[float]:
-    return [float(v) for v in torch.as_tensor(values).flatten()]
+        Returns:
+            bool (B, S): finite, not absurdly far from the data, and not absurdly far from `pose`.
+        """
+        width = self.state_high - self.state_low
+        widest = width.amax() if len(width) else width.sum()
+        slack = STATE_TOLERANCE * torch.maximum(width, 0.1 * widest)
+        near = state.isfinite() & (state >= self.state_low - slack) & (state <= self.state_high + slack)
+        step = STEP_TOLERANCE * torch.maximum(self.state_step, 0.02 * widest)
+        return near & ~((state - pose).abs() > step * (1 + missed.clamp(max=MISSED_TICKS)))

@@ -144,7 +144,7 @@ def test_missing_camera_names_those_there_are(counting_root):
     meta = tiny.metadata(counting_root, "me/counting")
     config = tiny.config(trained_on_cameras=["observation.images.wrist"])
     with pytest.raises(ValueError, match=r"lacks the camera observation.images.wrist.*observation.image"):
-        adopt(config, meta, meta.stats)
+        adopt(config, meta)
 
 
 def test_robot_with_a_single_joint_is_decoded_too(tmp_path):

@@ -171,7 +171,7 @@ def test_older_schema_is_refused_and_kept(store, root):
     written = json.loads(table.schema.metadata[METADATA]) | {"schema": 0}
     pq.write_table(table.replace_schema_metadata({METADATA: json.dumps(written)}), file)
     kept = file.read_bytes()
-    with pytest.raises(LabelFileError, match="has schema 0, this version reads and writes 1"):
+    with pytest.raises(LabelFileError, match="has schema 0, this version reads 1 and 2"):
         LabelStore(root, tiny.REPO_ID, ["failure"])
     assert file.read_bytes() == kept
 

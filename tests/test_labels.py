@@ -3,6 +3,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE, UNLABELLED, FailureLabels, UnlabelledDatasetError
+from lerobot_latentsafe.datasets.reading import BrokenFileError
 
 N = 6
 
@@ -67,7 +68,7 @@ def test_unlabelled_dataset_names_column_and_sidecar(tmp_path):
 
 
 def test_folder_that_is_no_dataset(tmp_path):
-    with pytest.raises(UnlabelledDatasetError, match="is it a LeRobotDataset"):
+    with pytest.raises(BrokenFileError, match="where the frames of a LeRobotDataset"):
         FailureLabels.load(tmp_path)
 
 

@@ -1,6 +1,7 @@
 import json
 import math
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,12 +15,13 @@ from safetensors.torch import load_file, save_file
 from lerobot_latentsafe import LatentSafeConfig, LatentSafeDubinsEnv
 from lerobot_latentsafe.base_policy import BasePolicy
 from lerobot_latentsafe.configuration_latentsafe import SEALED
+from lerobot_latentsafe.datasets.adoption import adopt_dataset
+from lerobot_latentsafe.datasets.contract import Contract
 from lerobot_latentsafe.decision import Reason
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, UntrainedFilterError
 from lerobot_latentsafe.runtime.checkpoint import CheckpointError, resolve_checkpoint, seal
 from lerobot_latentsafe.runtime.hub import save_policy
 from lerobot_latentsafe.training import train_reachability
-from lerobot_latentsafe.units import adopt_dataset
 
 load = LatentSafePolicy.from_pretrained
 
@@ -246,9 +248,11 @@ def test_dataset_of_another_robot_is_refused(tiny_world_model, cache_root, tmp_p
 @pytest.mark.parametrize(("low", "high"), [(-71.6, 71.6), (-1.25, 2.0)], ids=["degrees", "faster"])
 def test_dataset_of_another_action_range_is_refused(tiny_world_model, cache_meta, low, high):
     config = PreTrainedConfig.from_pretrained(tiny_world_model)
-    action = {**cache_meta.stats["action"], "min": [low, 1.0], "max": [high, 1.0]}
+    contract = Contract.read(cache_meta)
+    action = contract.action.copy()
+    action[:2, 0] = low, high
     with pytest.raises(ValueError, match=r"turn_rate.vel of me/car.*trained on -1\.25 to 1\.25.*unit"):
-        adopt_dataset(config.trained_on, cache_meta, {**cache_meta.stats, "action": action})
+        adopt_dataset(config.trained_on, replace(contract, action=action))
 
 
 def test_dataset_of_other_pictures_is_refused(tiny_world_model, dataset_meta):

@@ -220,7 +220,7 @@ def test_action_that_is_not_finite_falls_back(permissive, bad):
     assert decision.action.isfinite().all() and permissive.shield.executed.isfinite().all()
 
 
-@pytest.mark.parametrize("bad", [[1.3, 1.0], [-9.0, 1.0], [0.0, 2.0]])
+@pytest.mark.parametrize("bad", [[1.6, 1.0], [-9.0, 1.0], [0.0, 2.0]])
 def test_action_out_of_the_datas_range_falls_back(permissive, bad):
     decision = permissive.shield(along(1)[0], actions(LEFT, bad, LEFT))
     assert decision.reason.tolist() == [0, Reason.ACTION_OUT_OF_RANGE, 0]
@@ -307,12 +307,19 @@ def test_once_the_filter_acts_the_policy_is_released_above_another_value(permiss
 RETREAT, OUTSIDE = {"turn_rate.vel": -0.5}, [9.0, 1.0]
 
 
+@pytest.fixture
+def restless(permissive, monkeypatch):
+    """Passes whatever is not faulty, and finds it unsafe to stay."""
+    monkeypatch.setattr(permissive.shield, "_stays", lambda fault, *_: torch.zeros(len(fault), 1, dtype=torch.bool))
+    return permissive
+
+
 def retreats(decision):
     return (decision.action == torch.tensor([-0.5, 1.0])).all(-1).tolist()
 
 
-def test_after_some_overrides_the_retreat_acts_and_goes_on(permissive):
-    config, shield = permissive.config, permissive.shield
+def test_after_some_overrides_the_retreat_acts_and_goes_on(restless):
+    config, shield = restless.config, restless.shield
     config.law.retreat, config.law.retreat_after, config.law.min_retreat_steps = RETREAT, 2, 3
     one = actions(OUTSIDE, LEFT, LEFT)
     for proposed, acts, retreat in (
@@ -332,14 +339,14 @@ def test_after_some_overrides_the_retreat_acts_and_goes_on(permissive):
     assert retreats(shield(along(1)[0], one)) == [False] * 3
 
 
-def test_overrides_of_long_ago_do_not_count(permissive):
-    permissive.config.law.retreat, permissive.config.law.retreat_after = RETREAT, 1
+def test_overrides_of_long_ago_do_not_count(restless):
+    restless.config.law.retreat, restless.config.law.retreat_after = RETREAT, 1
     for pause, retreat in ((8, True), (10, False)):
-        permissive.shield.reset()
-        permissive.shield(along(1)[0], actions(OUTSIDE))
+        restless.shield.reset()
+        restless.shield(along(1)[0], actions(OUTSIDE))
         for _ in range(pause):
-            assert not permissive.shield(along(1)[0], actions(LEFT)).intervened.any()
-        assert retreats(permissive.shield(along(1)[0], actions(OUTSIDE))) == [retreat] * 3
+            assert not restless.shield(along(1)[0], actions(LEFT)).intervened.any()
+        assert retreats(restless.shield(along(1)[0], actions(OUTSIDE))) == [retreat] * 3
 
 
 def test_retreat_is_a_move_of_the_fallback_not_of_v(tiny_continuous_filter):
@@ -427,18 +434,18 @@ def test_robot_is_held_when_even_the_latent_is_not_finite(permissive):
     for permissive.config.law.retreat in ({}, RETREAT):
         decision = permissive.shield(along(1)[0], actions(LEFT))
         assert decision.reason.eq(Reason.VALUE_NOT_FINITE).all()
-        torch.testing.assert_close(decision.action, permissive.model.units.hold_action(3))
+        torch.testing.assert_close(decision.action, permissive.model.units.hold(torch.zeros(3, 2)))
 
 
 def test_hold_is_zero_motion_or_the_nearest_the_range_allows(policy):
     torch.testing.assert_close(
-        policy.model.units.hold_action(2), torch.tensor([[0.0, 1.0]] * 2)
+        policy.model.units.hold(torch.zeros(2, 2)), torch.tensor([[0.0, 1.0]] * 2)
     )  # the speed never varies
     policy.model.units.action_low[:], policy.model.units.action_high[:] = (
         torch.tensor([0.2, 1.0]),
         torch.tensor([0.9, 1.0]),
     )
-    torch.testing.assert_close(policy.model.units.hold_action(1), torch.tensor([[0.2, 1.0]]))
+    torch.testing.assert_close(policy.model.units.hold(torch.zeros(1, 2)), torch.tensor([[0.2, 1.0]]))
 
 
 def test_monitor_mode_lets_everything_through_and_reports(strict):
@@ -512,7 +519,7 @@ def test_baseline_laws_need_no_critic(tiny_world_model, law):
     assert decision.value.isfinite().all()
     if law == "margin":
         policy.config.law.epsilon = 2.0
-        torch.testing.assert_close(policy.shield(seen, proposed).action, policy.model.units.hold_action(1))
+        torch.testing.assert_close(policy.shield(seen, proposed).action, policy.model.units.hold(torch.zeros(1, 2)))
 
 
 def test_unknown_law_is_refused():

@@ -2,16 +2,22 @@
 
 import logging
 import sys
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import tiny
 import torch
+from lerobot.configs.types import PipelineFeatureType
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.processor import RobotActionProcessorStep, RobotProcessorPipeline, make_default_processors
+from lerobot.processor.converters import robot_action_observation_to_transition, transition_to_robot_action
 from lerobot.robots.utils import make_robot_from_config
+from lerobot.scripts import lerobot_record
 
 from lerobot_latentsafe import cli
+from lerobot_latentsafe.cli import record as recording_verbs
 from lerobot_latentsafe.decision import LawOptions, Reason
 from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES
 from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
@@ -531,17 +537,102 @@ def test_live_values_are_displayed(trained, viewer):
     assert {"observation.front", "observation.wrist"} <= {view["name"] for view in layout}
 
 
-def test_what_the_robot_clips_is_stored_clipped_and_sent_once(robot, monkeypatch):
+def test_what_the_robot_clips_is_what_was_sent(robot, monkeypatch):
     sent, half = [], lambda action: {name: value / 2 for name, value in action.items()}
     monkeypatch.setattr(robot.inner, "send_action", lambda action: sent.append(action) or half(action))
+    assert robot.take_sent() is None
     for _ in range(2):
         robot.get_observation()
-        stored = robot.send_early(PUSH)
-        assert stored == half(PUSH) and robot.send_action(stored) == stored
+        assert robot.send_action(PUSH) == robot.take_sent() == half(PUSH)
+        assert robot.take_sent() is None
     assert sent == [PUSH, PUSH]
-    with pytest.raises(ValueError, match="Nothing was sent"):
-        robot.send_early({"delta_x": 0.0})
-    assert len(sent) == 2
+
+
+# -- plugins that change what lies between operator, robot and dataset ---
+
+
+@dataclass
+class Halve(RobotActionProcessorStep):
+    """Halves every command."""
+
+    def action(self, action):
+        return {name: value / 2 for name, value in action.items()}
+
+    def transform_features(self, features):
+        return features
+
+
+class Rename(Halve):
+    """Stores commands of a tip, from which the robot's are found again, as in LeRobot's examples with a phone."""
+
+    def action(self, action):
+        return {f"tip_{name}": value for name, value in action.items()}
+
+    def transform_features(self, features):
+        return {**features, PipelineFeatureType.ACTION: self.action(features[PipelineFeatureType.ACTION])}
+
+
+class NameBack(Halve):
+    """The other half."""
+
+    def action(self, action):
+        return {name.removeprefix("tip_"): value for name, value in action.items()}
+
+
+def pipeline(step):
+    return RobotProcessorPipeline(
+        [step], to_transition=robot_action_observation_to_transition, to_output=transition_to_robot_action
+    )
+
+
+def alter(monkeypatch, how):
+    """What a third-party plugin of LeRobot may replace at its import, so that commands are halved, or renamed."""
+    loop, record, add = lerobot_record.record_loop, recording_verbs.record, LeRobotDataset.add_frame
+    operator, robot, seen = make_default_processors()
+
+    def looping(**changed):
+        monkeypatch.setattr(lerobot_record, "record_loop", lambda **given: loop(**{**given, **changed}))
+
+    if how == "processors of the operator":
+        monkeypatch.setattr(lerobot_record, "make_default_processors", lambda: (pipeline(Halve()), robot, seen))
+    elif how == "processors of the robot":
+        monkeypatch.setattr(lerobot_record, "make_default_processors", lambda: (operator, pipeline(Halve()), seen))
+    elif how == "the loop":
+        looping(teleop_action_processor=pipeline(Halve()), robot_action_processor=pipeline(Halve()))
+    elif how == "the command":
+        monkeypatch.setattr(
+            recording_verbs, "record", lambda cfg: record(cfg, robot_action_processor=pipeline(Halve()))
+        )
+    elif how == "names":
+        both = pipeline(Rename()), pipeline(NameBack())
+        monkeypatch.setattr(lerobot_record, "make_default_processors", lambda: (*both, seen))
+    elif how == "the dataset":
+        monkeypatch.setattr(
+            LeRobotDataset, "add_frame", lambda self, frame: add(self, {**frame, "action": frame["action"] / 2})
+        )
+
+
+@pytest.mark.parametrize("how", ["processors of the operator", "processors of the robot", "the loop", "the command"])
+@pytest.mark.parametrize("epsilon", [ALWAYS, NEVER])
+def test_whatever_a_plugin_changes_the_dataset_holds_what_the_robot_was_sent(
+    tmp_path, monkeypatch, executed, how, epsilon
+):
+    alter(monkeypatch, how)
+    trained = tiny.save_franka_filter(tmp_path / "filter", law_epsilon=epsilon)
+    cli.main(["record", *recording(trained, tmp_path / "data")])
+    stored = np.array(LeRobotDataset("me/shielded", root=tmp_path / "data").hf_dataset["action"])
+    sent = np.array([[action[name] for name in ACTION_NAMES] for _, action in executed])
+    assert all(min(np.abs(sent - row).max(1)) < 1e-6 for row in stored)
+    assert np.abs(stored[: len(stored) // 2] - sent[: len(stored) // 2]).max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("how", "words"), [("names", "was to be stored, and the robot was sent"), ("the dataset", "the robot executed")]
+)
+def test_a_recording_that_would_hold_something_else_is_refused(trained, tmp_path, monkeypatch, how, words):
+    alter(monkeypatch, how)
+    with pytest.raises(SystemExit, match=words):
+        cli.main(["record", *recording(trained, tmp_path / "data")])
 
 
 @pytest.mark.parametrize(("verb", "fps"), [("teleoperate", "--fps=60"), ("record", "--dataset.fps=30")])

@@ -56,7 +56,7 @@ def test_margins_are_those_of_filtering_frame_by_frame(policy, dataset_meta, cac
 
     found = dict(episode_margins(policy.model, DatasetFrames(dataset_meta), batch_size=5))
     assert sorted(found) == list(range(14))
-    reader, episode = adopt(policy.config, cache_meta, cache_meta.stats), 3
+    reader, episode = adopt(policy.config, cache_meta), 3
     index = np.flatnonzero(reader.labels.episode == episode)
     images, state = reader.cache.frames(index)
     action = policy.model.units.normalise_action(torch.from_numpy(reader.cache.action[index]))

@@ -56,15 +56,16 @@ def test_eight_bits_err_by_less_than_a_hundredth(dataset, token_root, tmp_path):
 
 
 def test_killed_build_goes_on_and_equals_an_undisturbed_one(dataset, token_root, tmp_path, monkeypatch):
-    perceive, calls = build_cache.Tokens.perceive, []
+    pieces, begun = build_cache.Sight.pieces, []
 
-    def killed(self, images):
-        calls.append(1)
-        if len(calls) == 4:
-            raise KeyboardInterrupt
-        return perceive(self, images)
+    def killed(self, place, numbers=None):
+        begun.extend([place] if numbers is None else [])
+        for piece in pieces(self, place, numbers):
+            yield piece
+            if len(begun) == 4:  # in the middle of an episode
+                raise KeyboardInterrupt
 
-    monkeypatch.setattr(build_cache.Tokens, "perceive", killed)
+    monkeypatch.setattr(build_cache.Sight, "pieces", killed)
     with pytest.raises(KeyboardInterrupt):
         build_frame_cache(dataset, tmp_path / "cut", tiny.TOKEN_SIZE, tiny.tokens())
     with pytest.raises(FrameCacheError, match="cut off"):
@@ -72,7 +73,7 @@ def test_killed_build_goes_on_and_equals_an_undisturbed_one(dataset, token_root,
     with pytest.raises(FileExistsError, match="unfinished cache of another"):
         build_frame_cache(dataset, tmp_path / "cut", 2 * tiny.TOKEN_SIZE, tiny.tokens())
     build_frame_cache(dataset, tmp_path / "cut", tiny.TOKEN_SIZE, tiny.tokens())
-    assert len(calls) == 1 + dataset.num_episodes  # the three finished episodes were kept
+    assert begun == [*range(4), *range(3, dataset.num_episodes)]  # the three finished episodes were kept
     for name, whole in arrays(token_root).items():
         np.testing.assert_array_equal(arrays(tmp_path / "cut")[name], whole)
 

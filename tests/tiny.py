@@ -156,6 +156,44 @@ def save_franka_filter(folder, scene="blocks", **changes):
     return folder
 
 
+ARM = ["lift.pos", "elbow.pos", "gripper.pos"]
+"""Joint targets in degrees, and of a gripper."""
+ARM_POSE = [-71.0, 68.0, 20.0]
+
+
+def save_arm_filter(folder, names=ARM, meanings=None, **changes):
+    """A filter of an arm that takes joint targets, with random weights, saved as if it were trained.
+
+    Its data went from 30 degrees below ARM_POSE to 30 above, by at most 6 degrees at once; 99% of them by 3.
+    """
+    from lerobot.configs.types import FeatureType, PolicyFeature
+
+    from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+    from lerobot_latentsafe.runtime.hub import save_policy
+
+    torch.manual_seed(0)
+    n, key = len(names), "observation.images.front"
+    pose, meanings = np.resize(ARM_POSE, n), meanings or dict.fromkeys(names, "target")
+    moves = lambda target, other: [target if meanings[name] == "target" else other for name in names]  # noqa: E731
+    options = dict(
+        fallback_action_candidates=None, law_lookahead=0, trained_on_cameras=[key], trained_on_fps=30,
+        trained_on_stage="critic",
+        input_features={
+            key: PolicyFeature(FeatureType.VISUAL, (3, 32, 32)),
+            "observation.state": PolicyFeature(FeatureType.STATE, (n,)),
+        },
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (n,))},
+        trained_on_state_names=list(names), trained_on_action_names=list(names), trained_on_meanings=meanings,
+        trained_on_action_low=(pose - 30).tolist(), trained_on_action_high=(pose + 30).tolist(),
+        trained_on_action_varies=[True] * n, trained_on_displacement_low=moves(-6.0, 0.0),
+        trained_on_displacement_high=moves(6.0, 0.0), trained_on_displacement_scale=moves(3.0, 1.0),
+        trained_on_state_low=(pose - 30).tolist(), trained_on_state_high=(pose + 30).tolist(),
+        trained_on_state_step=[2.0] * n, trained_on_state_mean=pose.tolist(), trained_on_state_std=[10.0] * n,
+    )  # fmt: skip
+    save_policy(LatentSafePolicy(config(**{**options, **changes})), Path(folder))
+    return folder
+
+
 def diffusion_config(action_dim=ACTION_DIM, **changes):
     from lerobot.configs.types import FeatureType, PolicyFeature
     from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig

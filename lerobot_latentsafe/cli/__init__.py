@@ -32,12 +32,13 @@ class Verb:
 
 GROUPS = {
     "record": "record episodes",
+    "dataset": "see whether they can be used",
     "label": "say where episodes fail",
     "train": "make a filter of them",
     "deploy": "use it",
     "evaluate": "ask what it is worth",
 }
-_RECORD, _LABEL, _TRAIN, _DEPLOY, _EVALUATE = (f"lerobot_latentsafe.cli.{group}" for group in GROUPS)
+_RECORD, _DATASET, _LABEL, _TRAIN, _DEPLOY, _EVALUATE = (f"lerobot_latentsafe.cli.{group}" for group in GROUPS)
 _DREAMER = "lerobot_latentsafe.experiments.blocks.dreamer_training"
 
 VERBS: dict[str, Verb] = {
@@ -47,9 +48,21 @@ VERBS: dict[str, Verb] = {
     "merge-decisions": Verb(
         "record", _RECORD, "MergeDecisions", "copy a recording with the shield's decisions as columns"
     ),
+    "check-dataset": Verb(
+        "dataset",
+        _DATASET,
+        "CheckDataset",
+        "print what a dataset says of its robot, and whether a filter can be made of it",
+    ),
+    "rename-features": Verb(
+        "dataset", _DATASET, "RenameFeatures", "copy a dataset with the names of features that LeRobot expects"
+    ),
     "label": Verb("label", _LABEL, "Label", "open a local page on which a person marks where episodes fail"),
     "auto-label": Verb("label", _LABEL, "AutoLabel", "let a function or a vision-language model label the rest"),
     "check-labels": Verb("label", _LABEL, "CheckLabels", "list the labels that a trained filter disagrees with"),
+    "carry-labels": Verb(
+        "label", _LABEL, "CarryLabels", "take over labels from the datasets that one was joined or cut from"
+    ),
     "write-labels": Verb(
         "label", _LABEL, "WriteLabels", "copy a dataset with its labels as columns, and push it on request"
     ),
@@ -82,6 +95,7 @@ RENAMED_VERBS = {"picture-features": "draw-features"}
 INTRODUCTION = """Latent safety filters for LeRobot.
 
 usage: latentsafe <verb> [--option=value ...]      latentsafe <verb> --help shows an example and all options
+                                                   --debug shows where an error was raised
 
 From episodes to a shielded policy:
   1. latentsafe collect --source=random --dataset.repo_id=me/car --dataset.root=data/car    (or lerobot-record)
@@ -110,7 +124,9 @@ def nearest(name: str, known: Iterable[str]) -> str | None:
 def main(argv: list[str] | None = None) -> None:
     """Entry point of the console command `latentsafe`."""
     os.environ.setdefault("MPLBACKEND", "Agg")  # pictures are written, never shown
-    verb, *options = (sys.argv[1:] if argv is None else argv) or ["--help"]
+    typed = sys.argv[1:] if argv is None else argv
+    debug = "--debug" in typed
+    verb, *options = [word for word in typed if word != "--debug"] or ["--help"]
     if verb in ("-h", "--help", "help"):
         if not options:
             return print(overview())
@@ -123,4 +139,4 @@ def main(argv: list[str] | None = None) -> None:
         meant = nearest(verb, VERBS)
         hint = f"did you mean {meant}? latentsafe --help lists all" if meant else f"expected one of {', '.join(VERBS)}"
         sys.exit(f"latentsafe: unknown verb {verb!r}; {hint}")
-    importlib.import_module("lerobot_latentsafe.cli.command_line").run(verb, VERBS[verb], options)
+    importlib.import_module("lerobot_latentsafe.cli.command_line").run(verb, VERBS[verb], options, debug)

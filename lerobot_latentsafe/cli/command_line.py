@@ -5,6 +5,7 @@ import inspect
 import logging
 import sys
 import textwrap
+import traceback
 import typing
 from collections.abc import Iterable, Iterator
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
@@ -150,19 +151,42 @@ def _blocks(doc: str) -> list[str]:
 # -- what was typed ---
 
 
-def run(verb: str, entry: Verb, argv: list[str]) -> None:
-    """Run a verb with what was typed after it; whatever is wrong ends the process with one line."""
-    quiet_decoder()
-    register_third_party_plugins()
+def run(verb: str, entry: Verb, argv: list[str], debug: bool = False) -> None:
+    """Run a verb with what was typed after it; whatever is wrong ends the process with one line.
+
+    Args:
+        debug: print an error's traceback before that line.
+    """
     try:
+        quiet_decoder()
+        register_third_party_plugins()
         options = getattr(importlib.import_module(entry.module), entry.name)
         if {"-h", "--help"} & set(argv):
             return print(help_text(verb, options, argv))
         command = parsed(verb, options, argv)
         logging.getLogger().setLevel(logging.INFO)
         command.run()
-    except (ValueError, OSError, RuntimeError, ImportError, KeyError, draccus.utils.DraccusException) as e:
-        sys.exit(f"latentsafe {verb}: {in_one_line(e)}")
+    except KeyboardInterrupt:
+        sys.exit(f"latentsafe {verb}: interrupted")
+    except Exception as e:
+        if debug:
+            traceback.print_exc()
+        sys.exit(f"latentsafe {verb}: {in_one_line(e) if _is_explained(e) else _unexplained(e)}")
+
+
+def _is_explained(error: Exception) -> bool:
+    """Whether an error was raised for people to read: by this package or the system, and in more than a few words."""
+    last = error.__traceback__
+    while last is not None and last.tb_next is not None:
+        last = last.tb_next
+    ours = last is not None and last.tb_frame.f_globals.get("__name__", "").startswith("lerobot_latentsafe")
+    system = isinstance(error, OSError | ImportError | draccus.utils.DraccusException)
+    meant = system or (ours and isinstance(error, ValueError | RuntimeError | KeyError))
+    return meant and len(in_one_line(error).split()) > 3
+
+
+def _unexplained(error: Exception) -> str:
+    return f"{type(error).__name__}: {in_one_line(error) or 'no message'} (--debug shows where)"
 
 
 def parsed(verb: str, options: type, argv: list[str]) -> Any:

@@ -221,7 +221,7 @@ class Report:
         if self.base_policy_path and self.env is None:
             raise ValueError("--base_policy_path runs a policy, but where? Give --env.type")
         policy = load_filter(self.policy.path, law=self.law, base_policy=self.base_policy_path)
-        recorded = self.dataset.frames() if self.dataset.repo_id else None
+        recorded = self.dataset.frames() if self.dataset.repo_id or self.dataset.root else None
         extra = car_parts if self.env is not None and self.env.type == CAR else None
         write_filter_report(self.output, policy, self.env, self.n_episodes, self.seed, recorded, extra)
         print(f"open {self.output}")

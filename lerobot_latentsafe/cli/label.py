@@ -2,18 +2,24 @@
 
 import getpass
 import os
+import sys
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
 
 from lerobot_latentsafe.cli.options import DatasetSource, DefaultPolicySource, OptionalPolicySource
 from lerobot_latentsafe.datasets.columns import push_dataset, write_columns
+from lerobot_latentsafe.datasets.labels import UNLABELLED
 from lerobot_latentsafe.evaluation.along_episodes import episode_margins
 from lerobot_latentsafe.labeling import automatic
+from lerobot_latentsafe.labeling.carrying import carry_labels, specifications_in
 from lerobot_latentsafe.labeling.disagreements import find_disagreements, in_words, write_disagreements
 from lerobot_latentsafe.labeling.store import LabelStore
 from lerobot_latentsafe.labeling.suggestions import Suggester
 from lerobot_latentsafe.modeling_latentsafe import load_filter
+
+SHOWN = 10
+"""Episodes without a label that are named."""
 
 
 @dataclass
@@ -58,6 +64,8 @@ class AutoLabel:
 
     latentsafe auto-label --labeller=my_module:my_function --dataset.repo_id=me/bag --dataset.root=data/bag
 
+    Every answer is saved before the next is asked for: if it is stopped, the same command goes on there.
+
     Labellers: dubins_truth (the car's recorded position), module:function (your own, see labeling/automatic.py), and
     vision_language, which asks the model at --url about --failure and takes well-formed answers only. A service's key
     is read from the environment variable LATENTSAFE_MODEL_KEY.
@@ -76,15 +84,18 @@ class AutoLabel:
     """What it is called there."""
 
     def run(self) -> None:
-        """Label, and say how many."""
+        """Label, and say how many; exits with 1 if an episode got no answer, or one that is no label."""
         labeller = self._find()
         frames = self.dataset.frames()
         store = LabelStore(frames.root, frames.meta.repo_id, [self.specification])
         result = automatic.label_automatically(store, frames, self.specification, labeller, self.labeller)
         for name, episodes in result.items():
             print(f"{name:10s} {len(episodes)} episodes")
-        for episode, why in result["refused"][:10]:
+        without = result["refused"] + result["failed"]
+        for episode, why in without[:SHOWN]:
             print(f"episode {episode}: {why}")
+        if without:
+            sys.exit(f"{len(without)} episodes got no label; the others are saved. The same command asks again")
 
     def _find(self) -> automatic.Labeller:
         if self.labeller != "vision_language":
@@ -120,6 +131,27 @@ class CheckLabels:
             print(f"episode {d.episode:5d}  {d.degree:.2f}  labelled: {label}")
         write_disagreements(self.output, found, store, frames, self.specification)
         print(f"{len(found)} disagreements; open {self.output}")
+
+
+@dataclass
+class CarryLabels:
+    """Take over labels from datasets that this one was joined, cut or copied from; episodes are known by content.
+
+    latentsafe carry-labels --sources='[data/bag,data/rollout]' --dataset.repo_id=me/all --dataset.root=data/all
+    """
+
+    sources: list[Path]
+    """Folders of labelled datasets, or of label files."""
+    dataset: DatasetSource = field(default_factory=DatasetSource)
+
+    def run(self) -> None:
+        """Carry labels over, and say how many."""
+        self.dataset.require_whole("carry-labels", "leave it out: episodes that no source has stay as they are")
+        names, meta = specifications_in(self.sources), self.dataset.metadata()
+        store = LabelStore(meta.root, meta.repo_id, names)
+        for name, n in carry_labels(store, self.sources).items():
+            labelled = sum((store.labels(name, e) != UNLABELLED).any() for e in range(len(store)))
+            print(f"{name}: {n} episodes have new labels; {labelled} of {len(store)} are labelled")
 
 
 @dataclass

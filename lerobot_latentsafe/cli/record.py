@@ -4,17 +4,17 @@ from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 
-from lerobot.processor import RobotActionProcessorStep, RobotProcessorPipeline
-from lerobot.processor.converters import robot_action_observation_to_transition, transition_to_robot_action
 from lerobot.robots.config import RobotConfig
 from lerobot.scripts.lerobot_record import RecordConfig, record
 from lerobot.scripts.lerobot_teleoperate import TeleoperateConfig, teleoperate
-from lerobot.utils.constants import HF_LEROBOT_HOME
+from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME
 
 from lerobot_latentsafe.cli.options import DatasetSource, NewDataset
 from lerobot_latentsafe.collection import dubins, franka, so101
+from lerobot_latentsafe.collection.sent_actions import storing_what_was_sent
 from lerobot_latentsafe.datasets.columns import write_decisions
-from lerobot_latentsafe.datasets.decisions import FILE
+from lerobot_latentsafe.datasets.decisions import FILE, check_recording
+from lerobot_latentsafe.datasets.labels import read_frames
 from lerobot_latentsafe.robots.shielded.config_shielded import LatentSafeShieldedConfig
 from lerobot_latentsafe.robots.shielded.shielded import connected_shield
 
@@ -80,19 +80,6 @@ class Collect:
 
 
 @dataclass
-class ShieldStep(RobotActionProcessorStep):
-    """The operator's action is executed here already, for what this step returns is what LeRobot stores."""
-
-    def action(self, action: dict[str, float]) -> dict[str, float]:
-        """What was executed instead of the operator's action."""
-        return connected_shield().send_early(action)
-
-    def transform_features(self, features: dict) -> dict:
-        """The features, which stay as they are."""
-        return features
-
-
-@dataclass
 class Record(RecordConfig):
     """Record any robot behind a filter, as lerobot-record does: the dataset's actions are the executed ones.
 
@@ -118,12 +105,10 @@ class Record(RecordConfig):
         journal = Path(dataset.root or HF_LEROBOT_HOME / dataset.repo_id) / FILE
         config = _lerobots(self, RecordConfig)
         config.robot = _shielded(self.robot, self.filter, fps=dataset.fps, journal=journal)
-        step = RobotProcessorPipeline(
-            [ShieldStep()],
-            to_transition=robot_action_observation_to_transition,
-            to_output=transition_to_robot_action,
-        )
-        record(config, teleop_action_processor=step)
+        with storing_what_was_sent(lambda: connected_shield().take_sent()):
+            dataset = record(config)
+        if journal.exists() and dataset.num_episodes:
+            check_recording(journal, read_frames(dataset.root, ["frame_index", ACTION]))
         print(f"the actions are what was executed; what was proposed is in {journal}")
 
 

@@ -47,7 +47,7 @@ class Cache:
         if cache is None:
             return  # another process finishes
         print(f"{cache.manifest['n_frames']} frames at {size} px in {self.output_dir}")
-        print(f"train with --dataset.repo_id={self.dataset.repo_id}_cache --dataset.root={self.output_dir}")
+        print(f"train with --dataset.repo_id={cache.manifest['repo_id']}_cache --dataset.root={self.output_dir}")
 
 
 @dataclass

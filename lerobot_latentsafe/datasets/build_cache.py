@@ -9,7 +9,8 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Protocol
@@ -18,13 +19,14 @@ import numpy as np
 import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.dataset_tools import delete_episodes, remove_feature
+from lerobot.datasets.io_utils import write_stats
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.utils.constants import ACTION, OBS_STATE
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 from tqdm import tqdm
 
 from lerobot_latentsafe._compat import drop_episode_statistics
+from lerobot_latentsafe.datasets.contract import Contract
 from lerobot_latentsafe.datasets.episodes import DatasetFrames
 from lerobot_latentsafe.datasets.frame_cache import (
     BASIS,
@@ -36,8 +38,8 @@ from lerobot_latentsafe.datasets.frame_cache import (
     basis_file,
     dataset_fingerprint,
 )
-from lerobot_latentsafe.datasets.labels import FOLDER as LABELS
-from lerobot_latentsafe.datasets.labels import Sidecar, identity, read_frames, sidecar_path, specifications_of
+from lerobot_latentsafe.datasets.label_places import sidecar_path, specifications_of
+from lerobot_latentsafe.datasets.labels import Content, Sidecar, all_labels
 from lerobot_latentsafe.encoders.perception import Perception, PerceptionConfig
 from lerobot_latentsafe.encoders.pictures import to_model_images
 from lerobot_latentsafe.runtime.files import refuse_existing, replacing
@@ -49,8 +51,22 @@ ENCODED_AT_ONCE = 8
 SAMPLED_EPISODES, SAMPLED_FRAMES = 100, 4000
 """From which principal components are found."""
 
-See = Callable[[int], dict[str, Tensor]]
-"""All frames of an episode as a world model takes them: camera key -> (T, 3, S, S) in [0, 1]."""
+
+@dataclass(frozen=True)
+class Sight:
+    """Episodes as a world model takes them, a few frames at a time."""
+
+    frames: DatasetFrames
+    image_size: int
+
+    def length(self, place: int) -> int:
+        """Frames of the episode at a place among those that are kept."""
+        return self.frames.length(self.frames.episodes[place])
+
+    def pieces(self, place: int, numbers: Sequence[int] | None = None) -> Iterator[dict[str, Tensor]]:
+        """Of all its frames, or of some, in order: camera key -> (n, 3, S, S) in [0, 1]."""
+        for piece in self.frames.pieces(self.frames.cameras, self.frames.episodes[place], numbers):
+            yield {key: to_model_images(images, self.image_size) for key, images in piece.items()}
 
 
 class Recipe(Protocol):
@@ -59,7 +75,7 @@ class Recipe(Protocol):
     arrays: dict[str, tuple[tuple[int, ...], str]]
     manifest: dict
 
-    def prepare(self, folder: Path, see: See, n_episodes: int) -> None:
+    def prepare(self, folder: Path, see: Sight, n_episodes: int) -> None:
         """What one process must do before any can start."""
 
     def start(self, folder: Path) -> None:
@@ -78,14 +94,14 @@ class Pictures:
         }
         self.manifest = {"image_size": image_size, "percepts": list(cameras)}
 
-    def prepare(self, folder: Path, see: See, n_episodes: int) -> None:
+    def prepare(self, folder: Path, see: Sight, n_episodes: int) -> None:
         """Nothing is needed beforehand."""
 
     def start(self, folder: Path) -> None:
         """Nothing is needed then."""
 
     def perceive(self, images: dict[str, Tensor]) -> dict[str, np.ndarray]:
-        """The pictures of an episode: camera key -> uint8 (T, 3, S, S)."""
+        """The pictures of some frames: camera key -> uint8 (T, 3, S, S)."""
         return {key: (value * 255).round().to(torch.uint8).numpy() for key, value in images.items()}
 
 
@@ -118,7 +134,7 @@ class Tokens:
             "encoder_hash": self.perception.config.encoder_hash,
         }
 
-    def prepare(self, folder: Path, see: See, n_episodes: int) -> None:
+    def prepare(self, folder: Path, see: Sight, n_episodes: int) -> None:
         """Take the principal components from elsewhere, or find them in a sample of frames."""
         if self.basis_from is not None:
             other = FrameCache.open(self.basis_from)
@@ -138,10 +154,8 @@ class Tokens:
         episodes = rng.permutation(n_episodes)[:SAMPLED_EPISODES]
         tokens = []
         for episode in episodes:
-            images = see(int(episode))
-            n = len(next(iter(images.values())))
-            picked = rng.permutation(n)[: -(-SAMPLED_FRAMES // len(episodes))]
-            tokens.append(self._tokens({key: value[picked] for key, value in images.items()}))
+            picked = rng.permutation(see.length(episode))[: -(-SAMPLED_FRAMES // len(episodes))]
+            tokens += [self._tokens(images) for images in see.pieces(episode, np.sort(picked))]
         torch.manual_seed(0)
         self.perception.basis.fit(torch.cat(tokens))
         save_file(self.perception.basis.state_dict(), folder / BASIS)
@@ -152,7 +166,7 @@ class Tokens:
         self.manifest["basis_hash"] = hashlib.sha256((folder / BASIS).read_bytes()).hexdigest()[:16]
 
     def perceive(self, images: dict[str, Tensor]) -> dict[str, np.ndarray]:
-        """Numbers of all frames of an episode: name -> (T, ...)."""
+        """Numbers of some frames: name -> (T, ...)."""
         tokens = self._tokens(images)
         vector = self.perception.basis(tokens).numpy()
         if self.dtype == "float16":
@@ -189,50 +203,61 @@ def build_frame_cache(
 
     Raises:
         FileExistsError: output_dir holds something else, a finished cache, or an unfinished one of something else.
-        FrameCacheError: the dataset has no camera.
+        DatasetContractError: a dataset that cannot be used as it is.
+        LabelFileError: its labels are none.
+        FrameCacheError: it has no camera.
     """
     output_dir, folder = Path(output_dir), Path(output_dir) / FOLDER
-    if not dataset.meta.camera_keys:
-        raise FrameCacheError(f"{dataset.repo_id} has no camera; its features are {list(dataset.meta.features)}")
     rank = int(os.environ.get("RANK", 0))
     unfinished = (folder / LAYOUT).exists() and not (folder / MANIFEST).exists()
     if rank == 0 and not unfinished:
         refuse_existing(output_dir)
+    contract = Contract.read(dataset.meta)
+    if not contract.cameras:
+        known = "".join(f"{key} is left out: {why}; " for key, why in contract.left_out.items())
+        raise FrameCacheError(
+            f"{dataset.repo_id} has no camera to cache: {known}its features are {', '.join(dataset.meta.features)}. "
+            "Record one with a camera"
+        )
+    all_labels(dataset.root, dataset.meta.features, dataset.repo_id)  # refuses what training would refuse
     frames = DatasetFrames(dataset.meta, episodes)
-    see = lambda i: _episode_images(frames, frames.episodes[i], image_size)  # noqa: E731
+    frames.cameras = list(contract.cameras)
+    see = Sight(frames, image_size)
     kept = recipe(frames.cameras, image_size)
     keep_freed_memory()
     if rank == 0 and not unfinished:
-        _lay_out(dataset, frames.episodes, output_dir, kept, see)
+        _lay_out(dataset, contract, frames.episodes, output_dir, kept, see)
     _await_layout(_layout(dataset, frames.episodes, kept), folder)
     kept.start(folder)
     copy = LeRobotDatasetMetadata(f"{dataset.repo_id}_cache", root=output_dir)
-    return _finish(dataset, copy, kept) if _fill(copy, kept, see) else None
+    return _finish(contract, copy, kept) if _fill(copy, kept, see) else None
 
 
-def _fill(copy: LeRobotDatasetMetadata, kept: Recipe, see: See) -> bool:
+def _fill(copy: LeRobotDatasetMetadata, kept: Recipe, see: Sight) -> bool:
     """Perceive this process's share of the episodes; whether all processes have done theirs."""
     rank, world = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
     folder = Path(copy.root) / FOLDER
-    arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r+") for name in kept.arrays}
     done = np.load(folder / DONE, mmap_mode="r+")
     mine = [e for e in range(rank, copy.total_episodes, world) if not done[e]]
     for episode in tqdm(mine, desc="decoding episodes", unit="episode", disable=rank > 0):
-        first = copy.episodes[episode]["dataset_from_index"]
-        for name, values in kept.perceive(see(episode)).items():
-            arrays[name][first : first + len(values)] = values
-            arrays[name].flush()
+        row = copy.episodes[episode]
+        at = row["dataset_from_index"]
+        for piece in see.pieces(episode):
+            for name, values in kept.perceive(piece).items():
+                _array(folder, name)[at : at + len(values)] = values
+            at += len(values)
+        if at != row["dataset_to_index"]:
+            raise FrameCacheError(f"{copy.root}: episode {episode} ends at frame {at}, not {row['dataset_to_index']}")
+        for name in kept.arrays:
+            _array(folder, name).flush()
         done[episode] = True
         done.flush()
     return bool(done.all())
 
 
-def _episode_images(frames: DatasetFrames, episode: int, image_size: int) -> dict[str, Tensor]:
-    images = {}
-    for key in frames.cameras:
-        stored = torch.from_numpy(frames.images(key, episode)).permute(0, 3, 1, 2)
-        images[key] = torch.cat([to_model_images(part, image_size) for part in stored.split(32)])
-    return images
+def _array(folder: Path, name: str) -> np.ndarray:
+    """An array to write into; what was written leaves this process's memory with it."""
+    return np.load(folder / f"{name}.npy", mmap_mode="r+")
 
 
 def _layout(dataset: LeRobotDataset, episodes: list[int], kept: Recipe) -> list:
@@ -241,17 +266,21 @@ def _layout(dataset: LeRobotDataset, episodes: list[int], kept: Recipe) -> list:
     return json.loads(json.dumps([dataset_fingerprint(dataset.meta), kept.arrays, kept.manifest, *some]))
 
 
-def _lay_out(dataset: LeRobotDataset, episodes: list[int], output_dir: Path, kept: Recipe, see: See) -> None:
+def _lay_out(
+    dataset: LeRobotDataset, contract: Contract, episodes: list[int], output_dir: Path, kept: Recipe, see: Sight
+) -> None:
     """Copy the dataset without images and make room for all frames; output_dir appears when that is done."""
     begun = output_dir.with_name(f"{output_dir.name}.begun")
     shutil.rmtree(begun, ignore_errors=True)
     copy = _without_cameras(dataset, episodes, begun)
     _copy_labels(dataset, episodes, begun)
+    if not copy.meta.stats:  # lerobot-train wants some
+        write_stats(Contract.read(copy.meta).statistics, begun)
     folder, n = begun / FOLDER, copy.num_frames
     folder.mkdir()
-    columns = copy.hf_dataset.with_format("numpy")
-    np.save(folder / "state.npy", np.asarray(columns[OBS_STATE], np.float32).reshape(n, -1))
-    np.save(folder / "action.npy", np.asarray(columns[ACTION], np.float32).reshape(n, -1))
+    rows = np.isin(contract.episode, episodes)
+    np.save(folder / "state.npy", contract.state[rows])
+    np.save(folder / "action.npy", contract.action[rows])
     for name, (shape, dtype) in kept.arrays.items():
         np.lib.format.open_memmap(folder / f"{name}.npy", mode="w+", dtype=dtype, shape=(n, *shape))
     np.save(folder / DONE, np.zeros(copy.num_episodes, bool))
@@ -273,19 +302,16 @@ def _without_cameras(dataset: LeRobotDataset, episodes: list[int], folder: Path)
 
 
 def _copy_labels(dataset: LeRobotDataset, episodes: list[int], folder: Path) -> None:
-    """The label files of these episodes for the copy of a dataset."""
-    labels = Path(dataset.root) / LABELS
-    if len(episodes) == dataset.num_episodes and labels.exists():
-        shutil.copytree(labels, folder / LABELS)
-        return
-    frames, kept = (read_frames(root, ["action"]) for root in (dataset.root, folder))
-    rows, n = np.isin(frames["episode_index"], episodes), len(kept["index"])
-    for name in specifications_of(dataset.root):
-        path = sidecar_path(folder, name)
-        path.parent.mkdir(exist_ok=True)
-        whole = Sidecar.read(sidecar_path(dataset.root, name), frames)
-        part = Sidecar(whole.failure[rows], whole.by[rows], whole.at[rows], whole.names)
-        part.write(path, dataset.repo_id, identity(kept, n))
+    """The labels of these episodes for the copy of a dataset, wherever their files lie."""
+    content, kept = Content(dataset.root), Content(folder)
+    rows = np.isin(content.frames["episode_index"], episodes)
+    for name in specifications_of(dataset.root, dataset.repo_id):
+        whole = Sidecar.find(dataset.root, name, content, dataset.repo_id)
+        if whole is not None:
+            path = sidecar_path(folder, name)
+            path.parent.mkdir(exist_ok=True)
+            part = Sidecar(whole.failure[rows], whole.by[rows], whole.at[rows], whole.names)
+            part.write(path, dataset.repo_id, kept)
 
 
 def _await_layout(expected: list, folder: Path, patience_s: float = 600) -> None:
@@ -302,9 +328,9 @@ def _await_layout(expected: list, folder: Path, patience_s: float = 600) -> None
         )
 
 
-def _finish(dataset: LeRobotDataset, copy: LeRobotDatasetMetadata, kept: Recipe) -> FrameCache:
-    cameras = {key: list(dataset.meta.features[key]["shape"]) for key in dataset.meta.camera_keys}
-    write_manifest(Path(copy.root), copy, cameras, {**kept.manifest, "repo_id": dataset.repo_id})
+def _finish(contract: Contract, copy: LeRobotDatasetMetadata, kept: Recipe) -> FrameCache:
+    cameras = {key: [height, width, channels] for key, (channels, height, width) in contract.cameras.items()}
+    write_manifest(Path(copy.root), copy, cameras, {**kept.manifest, "repo_id": contract.repo_id})
     return FrameCache.open(copy.root, copy)
 
 

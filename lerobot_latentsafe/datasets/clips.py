@@ -8,8 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lerobot_latentsafe._compat import training_run
+from lerobot_latentsafe.datasets.cameras import channels_first
+from lerobot_latentsafe.datasets.contract import Contract
 from lerobot_latentsafe.datasets.frame_cache import FOLDER, FrameCache, FrameCacheError
 from lerobot_latentsafe.datasets.labels import FailureLabels
+from lerobot_latentsafe.datasets.renaming import rename_command
 from lerobot_latentsafe.encoders.pictures import check_proportions
 from lerobot_latentsafe.units import Units
 
@@ -21,7 +25,7 @@ class Clip:
     Attributes:
         percepts: what `WorldModel.perceive` makes of each frame's images: name -> (B, T, ...).
         state: (B, T, S) proprioception.
-        action: (B, T, A) in [-1, 1], the action that led to each frame; zero where is_first.
+        action: (B, T, A), the motion that led to each frame, as the world model hears it; none where is_first.
         is_first: bool (B, T), frames with no past.
         valid: bool (B, T), False for padding.
         failure: (B, T), 1 failing, 0 safe, -1 unlabelled.
@@ -66,12 +70,14 @@ class FilterData:
     """What of a dataset a filter is trained on.
 
     Attributes:
+        contract: what the dataset says of its robot.
         labels: of failures.
         cache: its frames, if they are cached.
         frame_cache: the cache's folder.
         cameras: key -> (C, H, W) of those that the filter reads.
     """
 
+    contract: Contract
     labels: FailureLabels
     cache: FrameCache | None
     frame_cache: str | None
@@ -81,7 +87,7 @@ class FilterData:
     def open(
         cls, meta: Any, specification: str, frame_cache: str | None, image_size: int, cameras: list[str] | None = None
     ) -> "FilterData":
-        """Open the labels and, where there is one, the cache of a dataset.
+        """Check a dataset, and open its labels and, where there is one, its cache.
 
         Args:
             meta: LeRobotDatasetMetadata.
@@ -91,33 +97,31 @@ class FilterData:
             cameras: those that the filter reads; None: all.
 
         Raises:
+            DatasetContractError: a dataset that cannot be used as it is.
             UnlabelledDatasetError: no failure labels.
             FrameCacheError: a torn cache, one of another dataset, of another image size or of tokens of more cameras.
             ValueError: no camera at all, or none of that name.
         """
-        labels = FailureLabels.load(meta.root, specification)
-        if len(labels.failure) != meta.total_frames:
-            raise ValueError(f"{meta.root} holds {len(labels.failure)} frames on disk, {meta.total_frames} by its info")
+        contract = Contract.read(meta)
+        labels = FailureLabels.load(meta.root, specification, meta.repo_id)
         if frame_cache is None and (Path(meta.root) / FOLDER).exists():
             frame_cache = str(meta.root)
-        cache, shapes = None, {key: list(meta.features[key]["shape"]) for key in meta.camera_keys}
+        cache, shapes = None, contract.cameras
         if frame_cache is not None:
             cache = FrameCache.open(frame_cache, meta)
             cache.require_image_size(image_size)
-            shapes = cache.manifest["cameras"]
+            refuse_transforms(frame_cache)
+            shapes = {key: channels_first(key, {"shape": shape}) for key, shape in cache.manifest["cameras"].items()}
         chosen = cameras or sorted(shapes)
         missing = [key for key in chosen if key not in shapes]
         if missing or not chosen:
-            raise ValueError(
-                f"{meta.repo_id} lacks the camera {', '.join(missing) or 'images'}: it has "
-                f"{', '.join(shapes) or 'none'}. Record it, or name the cameras to use with --policy.trained_on.cameras"
-            )
+            raise ValueError(_lacks(contract, missing, list(shapes)))
         if cache is not None and "encoder_hash" in cache.manifest and set(shapes) != set(chosen):
             raise FrameCacheError(
                 f"cache {frame_cache} holds the tokens of {', '.join(shapes)} side by side, the filter sees "
                 f"{', '.join(chosen)} alone; cache a copy of the dataset with these cameras only"
             )
-        return cls(labels, cache, frame_cache, {key: _channels_first(shapes[key]) for key in chosen})
+        return cls(contract, labels, cache, frame_cache, {key: shapes[key] for key in chosen})
 
     def check_cameras(self, trained: dict[str, tuple[int, int, int]]) -> None:
         """Refuse cameras of other proportions than trained on, key -> (C, H, W).
@@ -133,9 +137,34 @@ class FilterData:
         return ClipReader(self.labels, self.cache, length, units)
 
 
-def _channels_first(shape: list[int]) -> tuple[int, int, int]:
-    height, width, channels = shape
-    return channels, height, width
+def _lacks(contract: Contract, missing: list[str], cameras: list[str]) -> str:
+    """What is said of a dataset without the cameras that a filter reads."""
+    renames = {key: missing[0] for key in list(contract.cameras)[:1] if missing}
+    remedy = (
+        "Name the cameras to use with --policy.trained_on.cameras, or, if it is the same camera by another name, "
+        f"rename it: {rename_command(contract.root, renames)}"
+        if renames
+        else "Record one, or download the whole dataset"
+    )
+    left_out = "".join(f"; {key} is left out: {why}" for key, why in contract.left_out.items())
+    return (
+        f"{contract.repo_id} lacks the camera {', '.join(missing) or 'images'}: it has "
+        f"{', '.join(cameras) or 'none'}{left_out}. {remedy}"
+    )
+
+
+def refuse_transforms(frame_cache: str) -> None:
+    """Refuse LeRobot's image transforms on frames that are cached, which they would leave as they are, unsaid.
+
+    Raises:
+        ValueError: with the remedy.
+    """
+    run = training_run()
+    if run is not None and run.dataset.image_transforms.enable:
+        raise ValueError(
+            f"--dataset.image_transforms.enable=true has no effect on the cached frames in {frame_cache}: pictures are "
+            "transformed when they are decoded. Leave the option out, or train on the dataset with pictures"
+        )
 
 
 class ClipReader:
@@ -159,12 +188,15 @@ class ClipReader:
         index = batch["index"].reshape(-1).cpu().numpy()
         if self.cache is not None:
             return self.cut(index, model.world_model.percept_names)
-        valid = ~batch["observation.state_is_pad"]
         eyes = model.world_model
+        valid = ~batch[f"{eyes.image_keys[0]}_is_pad"]
         images = {k: model.images(batch[k]).flatten(0, 1) for k in eyes.image_keys}
         percepts = {k: v.unflatten(0, valid.shape) for k, v in eyes.perceive(images).items()}
         # LeRobot drops the last axis of features of a single number.
-        state, action = (batch[k].reshape(*valid.shape, -1) for k in ("observation.state", "action"))
+        action = batch["action"].reshape(*valid.shape, -1)
+        state = action[..., :0]
+        if "observation.state" in batch:
+            state = batch["observation.state"].reshape(*valid.shape, -1)
         window = np.minimum(index[:, None] + np.arange(self.length), len(self.labels.failure) - 1)
         return self._assemble(window, percepts, state, action, valid)
 
@@ -195,10 +227,12 @@ class ClipReader:
         units, device = self.units, self.units.device
         is_first = torch.zeros(window.shape, dtype=torch.bool, device=device)
         is_first[:, 0] = True
-        action = units.normalise_action(action.to(device).float()).clamp(-1, 1)
+        state = state.to(device).float()
+        before = torch.cat([state[:, :1], state[:, :-1]], 1)  # the state at which each action was chosen
+        action = units.heard_action(action.to(device).float(), before)
         return Clip(
             percepts=percepts,
-            state=units.normalise_state(state.to(device)),
+            state=units.normalise_state(state),
             action=torch.where(is_first[..., None], units.first_action(action), action),
             is_first=is_first,
             valid=valid.to(device),

@@ -7,7 +7,8 @@ from lerobot.datasets.dataset_tools import modify_features, remove_feature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_latentsafe.datasets.decisions import FILE, decision_columns
-from lerobot_latentsafe.datasets.labels import LabelFileError, Sidecar, read_frames, sidecar_path, specifications_of
+from lerobot_latentsafe.datasets.label_places import LabelFileError, specifications_of
+from lerobot_latentsafe.datasets.labels import Content, Sidecar, read_frames
 from lerobot_latentsafe.runtime.files import refuse_existing
 from lerobot_latentsafe.runtime.hub import HUB_FAILURES, HubUnreachableError
 
@@ -26,13 +27,13 @@ def write_columns(
         FileExistsError: output_dir exists.
     """
     refuse_existing(output_dir)
-    frames, columns = read_frames(dataset.root, ["action"]), {}
+    content, columns = Content(dataset.root), {}
     for name in specifications:
-        path = sidecar_path(dataset.root, name)
-        if not path.exists():
-            known = ", ".join(specifications_of(dataset.root)) or "none; run latentsafe label first"
+        found = Sidecar.find(dataset.root, name, content, dataset.repo_id)
+        if found is None:
+            known = ", ".join(specifications_of(dataset.root, dataset.repo_id)) or "none; run latentsafe label first"
             raise LabelFileError(f"{dataset.repo_id} has no label file {name!r}; it has {known}")
-        columns[name] = (Sidecar.read(path, frames).failure.astype("int64"), COLUMN)
+        columns[name] = (found.failure.astype("int64"), COLUMN)
     return _with_columns(dataset, columns, output_dir, repo_id)
 
 

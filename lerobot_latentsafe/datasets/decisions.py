@@ -111,6 +111,30 @@ def decision_columns(path: Path, frames: dict[str, np.ndarray]) -> dict[str, np.
     }
 
 
+def check_recording(path: Path, frames: dict[str, np.ndarray]) -> None:
+    """Refuse a recording whose stored actions are not those that its journal says the robot executed.
+
+    Args:
+        frames: episode_index, frame_index (N,) and action (N, A) of the dataset. Episodes without decisions, recorded
+            in another way, are left alone.
+
+    Raises:
+        ValueError: naming the first frame that differs, with what to do.
+    """
+    executed = {(row["episode_index"], row["frame_index"]): row["executed"] for row in _read(path).to_pylist()}
+    decided = {episode for episode, _ in executed}
+    for episode, frame, stored in zip(
+        frames["episode_index"].tolist(), frames["frame_index"].tolist(), frames["action"]
+    ):
+        sent = executed.get((episode, frame))
+        if episode in decided and (sent is None or not np.allclose(sent, stored, rtol=1e-5, atol=1e-6)):
+            raise ValueError(
+                f"episode {episode}, frame {frame} stores {stored.tolist()}, and the robot executed {sent}: something "
+                "changes what LeRobot stores. Record again without that plugin; what was executed is in "
+                f"{path}"
+            )
+
+
 def _check_dataset(path: Path, rows: dict[tuple, dict], wanted: list[tuple], action: np.ndarray) -> None:
     missing = [key for key in wanted if key not in rows]
     if missing:

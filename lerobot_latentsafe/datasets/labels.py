@@ -2,114 +2,182 @@
 
 import hashlib
 import json
-import re
+import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from lerobot_latentsafe.datasets.fingerprints import by_length_alone, episode_spans, fingerprint, telling_columns
+from lerobot_latentsafe.datasets.frame_labels import FAILING, SAFE, UNLABELLED, FrameLabels
+from lerobot_latentsafe.datasets.label_places import (
+    FOLDER,
+    NAME,
+    LabelFileError,
+    UnlabelledDatasetError,
+    label_files,
+    label_folders_nearby,
+    sidecar_path,
+    specifications_of,
+)
+from lerobot_latentsafe.datasets.reading import DOWNLOAD_AGAIN, BrokenFileError, reading
 from lerobot_latentsafe.runtime.files import replacing
 
-FAILING, SAFE, UNLABELLED = 1, 0, -1
-FOLDER, SCHEMA, METADATA = "labels", 1, b"latentsafe_labels"
-NAME = re.compile(r"(?!action|observation|index|episode|frame|task|timestamp|next)[a-z][a-z0-9_]{0,39}")
-"""Names of specifications: a file and a column, and none that LeRobot would hand to a policy."""
+logger = logging.getLogger(__name__)
 
-
-class UnlabelledDatasetError(ValueError):
-    """The dataset has no usable failure labels."""
-
-
-class LabelFileError(UnlabelledDatasetError):
-    """A label file of another dataset, of another schema, or with values that are no labels."""
-
-
-def sidecar_path(root: str | Path, specification: str) -> Path:
-    """`labels/<specification>.parquet` of a dataset.
-
-    Raises:
-        LabelFileError: the name is not fit for a file and a column.
-    """
-    if not NAME.fullmatch(specification):
-        raise LabelFileError(
-            f"specification name {specification!r} is not usable: expected lower-case letters, digits and _ (at most "
-            "40, a letter first), such as failure or spilled, and no name that LeRobot gives columns of its own"
-        )
-    return Path(root) / FOLDER / f"{specification}.parquet"
-
-
-def specifications_of(root: str | Path) -> list[str]:
-    """Names of the specifications that have a label file."""
-    return sorted(p.stem for p in (Path(root) / FOLDER).glob("*.parquet") if NAME.fullmatch(p.stem))
+SCHEMA, METADATA = 2, b"latentsafe_labels"
 
 
 def read_frames(root: str | Path, columns: Iterable[str] = ()) -> dict[str, np.ndarray]:
     """`index`, `episode_index` and those of `columns` that exist, of every frame in the order of the index.
 
     Raises:
-        UnlabelledDatasetError: no dataset at root.
+        BrokenFileError: no dataset at root, or a file of it that cannot be read.
     """
     files = sorted(Path(root).glob("data/*/*.parquet"))
     if not files:
-        raise UnlabelledDatasetError(f"{root} holds no data/*/*.parquet; is it a LeRobotDataset (v3) folder?")
-    present = set(pq.ParquetFile(files[0]).schema_arrow.names)
+        raise BrokenFileError(
+            f"{root} holds no data/*/*.parquet, where the frames of a LeRobotDataset (v3) lie; {DOWNLOAD_AGAIN}"
+        )
+    with reading(files[0]):
+        present = set(pq.ParquetFile(files[0]).schema_arrow.names)
     wanted = ["index", "episode_index", *sorted(set(columns) & present)]
-    table = pa.concat_tables([pq.read_table(file, columns=wanted) for file in files]).combine_chunks()
-    order = np.argsort(np.asarray(table["index"]))
-    return {name: _to_numpy(table[name].combine_chunks())[order] for name in wanted}
+    frames = [_read_columns(file, wanted) for file in files]
+    read = {name: _joined([part[name] for part in frames]) for name in wanted}
+    order = np.argsort(read["index"], kind="stable")
+    return {name: values[order] for name, values in read.items()}
 
 
-def _to_numpy(column: pa.Array) -> np.ndarray:
+def _read_columns(file: Path, names: list[str]) -> dict[str, np.ndarray]:
+    with reading(file):
+        table = pq.ParquetFile(file).read(columns=names)
+        return {name: _to_numpy(table[name]) for name in names}
+
+
+def _joined(parts: list[np.ndarray]) -> np.ndarray:
+    """Of all files; arrays of objects where they are not of one shape."""
+    if len({part.shape[1:] for part in parts}) > 1:
+        parts = [np.fromiter(part, object, len(part)) for part in parts]
+    return np.concatenate(parts)
+
+
+def _to_numpy(column: pa.Array | pa.ChunkedArray) -> np.ndarray:
     """(N,) or (N, D): lists of one length become rows, anything ragged or with holes an array of objects."""
     if isinstance(column, pa.ChunkedArray):
         column = pa.concat_arrays(column.chunks) if column.num_chunks else pa.array([], column.type)
-    if pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type):
-        values = column.flatten().to_numpy(zero_copy_only=False)
-        if len(column) and len(values) % len(column) == 0:
-            return values.reshape(len(column), -1)
-    return column.to_numpy(zero_copy_only=False)
+    values, n = _plain(column), len(column)
+    while _is_list(values.type):
+        lengths = set(values.value_lengths().to_pylist()) if not pa.types.is_fixed_size_list(values.type) else {0}
+        if len(lengths) > 1 or values.null_count:
+            return column.to_numpy(zero_copy_only=False)
+        values = _plain(values.flatten())
+    numbers = values.to_numpy(zero_copy_only=False)
+    return numbers.reshape(n, -1) if _is_list(_plain(column).type) and n else numbers
 
 
-def identity(frames: dict[str, np.ndarray], n: int) -> str:
-    """Tells datasets apart by the episodes and actions of their first n frames.
-
-    Copies without cameras, with more columns or with episodes recorded since keep the identity of those n frames.
-    """
-    digest = hashlib.sha256(np.ascontiguousarray(frames["episode_index"][:n], dtype="<i8").tobytes())
-    if "action" in frames:
-        digest.update(np.ascontiguousarray(frames["action"][:n], dtype="<f4").tobytes())
-    return digest.hexdigest()[:16]
+def _plain(column: pa.Array) -> pa.Array:
+    """Without what LeRobot's and Arrow's types wrap around the values."""
+    if isinstance(column.type, pa.ExtensionType):
+        column = column.storage
+    return column.dictionary_decode() if pa.types.is_dictionary(column.type) else column
 
 
-@dataclass
-class Sidecar:
-    """The label file of one specification: labels by frame index, and who gave each, and when.
+def _is_list(kind: pa.DataType) -> bool:
+    return pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
+
+
+class Content:
+    """The numbers of a dataset, which tell its episodes apart.
+
+    Args:
+        root: the dataset's folder.
+        more: further columns to read.
 
     Attributes:
-        failure: int8 (N,).
-        by: int32 (N,), a place in `names`, or -1.
-        at: int64 (N,), microseconds since 1970 UTC; 0 where unlabelled or unknown.
-        names: who labelled.
+        frames: the columns that were read; see `read_frames`.
+        columns: names of those that tell episodes apart.
+
+    Raises:
+        UnlabelledDatasetError: no dataset at root.
     """
 
-    failure: np.ndarray
-    by: np.ndarray
-    at: np.ndarray
-    names: list[str]
+    def __init__(self, root: str | Path, more: Iterable[str] = ()):
+        self.root = Path(root)
+        self.columns = telling_columns(self.root)
+        self.frames = read_frames(root, [*self.columns, "action", *more])
+        self._fingerprints: dict[tuple[str, ...], list[str]] = {}
+
+    def __len__(self) -> int:
+        return len(self.frames["index"])
+
+    @cached_property
+    def spans(self) -> tuple[np.ndarray, np.ndarray]:
+        """First frame index and length of each episode; see `episode_spans`."""
+        return episode_spans(self.frames["episode_index"])
+
+    def fingerprints(self, columns: list[str]) -> list[str]:
+        """One for each episode, of these columns; none if the dataset lacks one of them."""
+        if tuple(columns) in self._fingerprints:
+            return self._fingerprints[tuple(columns)]
+        if missing := set(columns) - set(self.frames):
+            self.frames |= read_frames(self.root, missing)
+        rows = (slice(first, first + n) for first, n in zip(*self.spans))
+        known = set(columns) <= set(self.frames)
+        found = [fingerprint(self.frames, columns, span) for span in rows] if known else []
+        return self._fingerprints.setdefault(tuple(columns), found)
+
+    @cached_property
+    def identity(self) -> str:
+        """One fingerprint for the whole dataset."""
+        return hashlib.sha256("".join(self.fingerprints(self.columns)).encode()).hexdigest()[:16]
+
+    def identity_by_actions(self, n: int) -> str:
+        """What label files of schema 1 know a dataset by: episodes and actions of its first n frames."""
+        digest = hashlib.sha256(np.ascontiguousarray(self.frames["episode_index"][:n], dtype="<i8").tobytes())
+        if "action" in self.frames:
+            digest.update(np.ascontiguousarray(self.frames["action"][:n], dtype="<f4").tobytes())
+        return digest.hexdigest()[:16]
+
+
+class Sidecar(FrameLabels):
+    """The label file of one specification."""
 
     @classmethod
-    def empty(cls, n: int) -> "Sidecar":
-        """Labels of n frames that nobody has labelled."""
-        return cls(np.full(n, UNLABELLED, np.int8), np.full(n, -1, np.int32), np.zeros(n, np.int64), [])
+    def find(
+        cls, root: str | Path, specification: str, content: Content, repo_id: str | None = None
+    ) -> "Sidecar | None":
+        """What all label files of a dataset say, wherever they lie; the later verdict counts. None: there is none.
+
+        Raises:
+            LabelFileError: the file that new labels would go to is not this dataset's, or not usable.
+        """
+        own, found = sidecar_path(root, specification, repo_id), None
+        at_home = (own.parent, Path(root).absolute() / FOLDER)
+        for file in label_files(root, specification, repo_id):
+            try:
+                read = cls.read(file, content, repo_id, by_place=file.parent in at_home)
+            except LabelFileError as e:
+                if file == own:
+                    raise
+                logger.info("not used: %s", e)
+                continue
+            found = read if found is None else found.updated(read)
+        return found
 
     @classmethod
-    def read(cls, path: Path, frames: dict[str, np.ndarray]) -> "Sidecar":
+    def read(cls, path: Path, content: Content, repo_id: str | None = None, by_place: bool = True) -> "Sidecar":
         """Read a file written by `write`, or a plain table with the columns `index` and `failure`.
 
-        A file written before more episodes were recorded leaves those unlabelled.
+        An episode is known by its content: of a dataset that was recorded on, cut or joined since, each episode has
+        its labels, and those that the file does not know are unlabelled.
+
+        Args:
+            repo_id: the dataset's id, where it is known.
+            by_place: whether the file's place tells that it is this dataset's, where nothing in it does.
 
         Raises:
             LabelFileError: of another dataset, of another schema, not readable, or values that are no labels.
@@ -121,10 +189,34 @@ class Sidecar:
         missing = {"index", "failure"} - set(table.column_names)
         if missing:
             raise LabelFileError(f"{path} lacks the columns {sorted(missing)}; expected index and failure")
-        n, index = len(frames["index"]), _to_numpy(table["index"].combine_chunks())
-        covered = n
-        if METADATA in (table.schema.metadata or {}):
-            covered = cls._check_metadata(path, json.loads(table.schema.metadata[METADATA]), frames)
+        written = json.loads((table.schema.metadata or {}).get(METADATA, b"null"))
+        if not by_place and _knows_little(written, content):
+            raise LabelFileError(f"{path} does not tell of which episodes it is; move it to its dataset")
+        if written is None:
+            return cls._of_table(table, len(content), len(content), path)
+        if written.get("schema") not in (1, SCHEMA):
+            raise LabelFileError(
+                f"{path} has schema {written.get('schema')}, this version reads 1 and {SCHEMA}; "
+                "use the version that wrote it, or move the file away. Nothing was overwritten"
+            )
+        covered = written["frames"]
+        if written["schema"] == SCHEMA:
+            stored = cls._of_table(table, covered, covered, path)
+            found = stored.moved(content, written["columns"], written["episodes"], written["lengths"])
+        else:
+            found = cls._of_schema_1(table, written, content, repo_id, path)
+        if found is None:
+            raise LabelFileError(
+                f"{path} was made for another dataset ({written['repo_id']}, {covered} frames, {written['identity']}); "
+                f"this one has {len(content)} frames ({content.identity}). Move the file to its dataset. Nothing was "
+                "overwritten"
+            )
+        return found
+
+    @classmethod
+    def _of_table(cls, table: pa.Table, covered: int, n: int, path: Path) -> "Sidecar":
+        """Labels of n frames, from a table of the first `covered`."""
+        index = _to_numpy(table["index"].combine_chunks())
         if len(index) != covered or not np.array_equal(np.sort(index), np.arange(covered)):
             raise LabelFileError(
                 f"{path} labels {len(index)} frames, the dataset has {n}; expected each index 0..{covered - 1} once. "
@@ -141,28 +233,33 @@ class Sidecar:
             sidecar.at[index] = table["labelled_at"].cast(pa.int64()).fill_null(0).to_numpy()
         return sidecar
 
-    @staticmethod
-    def _check_metadata(path: Path, written: dict, frames: dict[str, np.ndarray]) -> int:
-        """How many frames a file covers, once its schema and dataset are known to be ours."""
-        if written.get("schema") != SCHEMA:
-            raise LabelFileError(
-                f"{path} has schema {written.get('schema')}, this version reads and writes {SCHEMA}; "
-                "use the version that wrote it, or move the file away. Nothing was overwritten"
-            )
+    @classmethod
+    def _of_schema_1(
+        cls, table: pa.Table, written: dict, content: Content, repo_id: str | None, path: Path
+    ) -> "Sidecar | None":
+        """From a file that knows its dataset by actions, or, where there are none, by its name."""
         covered = written["frames"]
-        found = identity(frames, covered) if covered <= len(frames["index"]) else "fewer frames"
-        if found != written["identity"]:
-            raise LabelFileError(
-                f"{path} was made for another dataset ({written['repo_id']}, {covered} frames, {written['identity']}); "
-                f"this one has {len(frames['index'])} frames ({found}). Move the file to its dataset. Nothing was "
-                "overwritten"
-            )
-        return covered
+        if covered > len(content) or content.identity_by_actions(covered) != written["identity"]:
+            return None
+        if "action" not in content.frames and repo_id not in (None, written["repo_id"], f"{written['repo_id']}_cache"):
+            return None
+        return cls._of_table(table, covered, len(content), path)
 
-    def write(self, path: Path, repo_id: str, identity: str) -> None:
-        """Replace the file atomically: whatever happens, the old or the new one is there, whole."""
+    def moved(self, content: Content, columns: list[str], episodes: list[str], lengths: list[int]) -> "Sidecar | None":
+        """The same labels on the frames of another dataset; see `onto`."""
+        there = content.fingerprints(columns)
+        return self.onto(columns, episodes, lengths, there, content.spans[0], len(content))
+
+    def write(self, path: Path, repo_id: str, content: Content) -> None:
+        """Replace the file atomically: whatever happens, the old or the new one is there, whole.
+
+        Args:
+            content: of the dataset whose frames these are.
+        """
         n = len(self.failure)
-        described = {"schema": SCHEMA, "frames": n, "identity": identity, "repo_id": repo_id}
+        described = {"schema": SCHEMA, "frames": n, "identity": content.identity, "repo_id": repo_id}
+        described |= {"columns": content.columns, "lengths": content.spans[1].tolist()}
+        described |= {"episodes": content.fingerprints(content.columns)}
         by = pa.DictionaryArray.from_arrays(pa.array(self.by, mask=self.by < 0), pa.array(self.names, pa.string()))
         table = pa.table(
             {
@@ -182,6 +279,25 @@ class Sidecar:
             )
 
 
+def _knows_little(written: dict | None, content: Content) -> bool:
+    """Whether nothing in a label file but lengths tells of which episodes it is."""
+    if written is None or "columns" not in written:
+        return written is None or "action" not in content.frames
+    return by_length_alone(written["columns"])
+
+
+def labelled_nearby(specification: str, content: Content) -> list[Path]:
+    """Folders with labels of other datasets that hold some of the same episodes, as after a merge or a deletion."""
+    found = []
+    for folder in label_folders_nearby(content.root):
+        try:
+            Sidecar.read(folder / f"{specification}.parquet", content, by_place=False)
+        except (LabelFileError, OSError):
+            continue
+        found.append(folder)
+    return found
+
+
 @dataclass
 class FailureLabels:
     """Labels by the dataset's frame index.
@@ -197,33 +313,32 @@ class FailureLabels:
     episode: np.ndarray
 
     @classmethod
-    def load(cls, root: str | Path, specification: str = "failure") -> "FailureLabels":
+    def load(cls, root: str | Path, specification: str = "failure", repo_id: str | None = None) -> "FailureLabels":
         """Read labels of a dataset on disk.
 
         They come from the column `specification`, or from the sidecar `labels/<specification>.parquet` with the
-        columns `index` and `failure`, which wins where both exist.
+        columns `index` and `failure`, which wins where both exist. It lies in the dataset's folder, or in LeRobot's
+        home; see `label_folders`.
+
+        Args:
+            repo_id: the dataset's id, where it is known.
 
         Raises:
             UnlabelledDatasetError: neither exists, a sidecar does not match the frames, or one class is missing.
         """
         root = Path(root)
-        data = read_frames(root, [specification, "next.done", "action"])
-        n, episode = len(data["index"]), data["episode_index"].astype(np.int64)
-        terminal = np.full(n, UNLABELLED, np.int8)
+        content = Content(root, [specification, "next.done"])
+        data, n = content.frames, len(content)
+        episode, terminal = data["episode_index"].astype(np.int64), np.full(n, UNLABELLED, np.int8)
         if "next.done" in data:
             terminal = as_labels(data["next.done"], n, f"column 'next.done' of {root}")
-        sidecar = sidecar_path(root, specification)
-        if sidecar.exists():
-            failure = Sidecar.read(sidecar, data).failure
+        sidecar = Sidecar.find(root, specification, content, repo_id)
+        if sidecar is not None:
+            failure = sidecar.failure
         elif specification in data:
             failure = as_labels(data[specification], n, f"column {specification!r} of {root}")
         else:
-            columns = pq.ParquetFile(next(root.glob("data/*/*.parquet"))).schema_arrow.names
-            raise UnlabelledDatasetError(
-                f"{root} has no failure labels: expected a column {specification!r} (1 failing, 0 "
-                f"safe, -1 unlabelled) or {sidecar.relative_to(root)}, which latentsafe label makes; its columns are "
-                f"{', '.join(sorted(columns))}, its label files {', '.join(specifications_of(root)) or 'none'}"
-            )
+            raise UnlabelledDatasetError(_no_labels(content, specification, repo_id))
         labels = cls(failure, terminal, episode)
         labels._check(root, specification)
         return labels
@@ -240,6 +355,52 @@ class FailureLabels:
     def balance(self) -> float:
         """Share of failing frames among the labelled."""
         return float((self.failure == FAILING).sum() / (self.failure != UNLABELLED).sum())
+
+
+def _no_labels(content: Content, specification: str, repo_id: str | None) -> str:
+    columns = pq.ParquetFile(next(content.root.glob("data/*/*.parquet"))).schema_arrow.names
+    known = ", ".join(specifications_of(content.root, repo_id)) or "none"
+    said = (
+        f"{content.root} has no failure labels: expected a column {specification!r} (1 failing, 0 safe, -1 unlabelled) "
+        f"or the file {sidecar_path(content.root, specification, repo_id)}, which latentsafe label makes; its columns "
+        f"are {', '.join(sorted(columns))}, its label files {known}"
+    )
+    if near := labelled_nearby(specification, content):
+        said += f". {carry_hint(near)}"
+    return said
+
+
+def carry_hint(folders: list[Path]) -> str:
+    """Where episodes of a dataset are labelled, and how to carry the labels over."""
+    return (
+        f"Episodes of it are labelled in {', '.join(map(str, folders))}; carry the labels over with latentsafe "
+        f"carry-labels --sources='[{','.join(map(str, folders))}]'"
+    )
+
+
+def all_labels(root: str | Path, features: dict[str, dict], repo_id: str | None = None) -> dict[str, np.ndarray]:
+    """The labels of all specifications that a dataset has, name -> int8 (N,).
+
+    Args:
+        features: of the dataset. `failure` must hold labels; others do if their name is fit and all values are labels.
+        repo_id: of the dataset, for label files that do not lie in its folder.
+
+    Raises:
+        LabelFileError: a label file of another dataset, or values that are no labels.
+    """
+    numbers = [name for name, f in features.items() if f["dtype"].startswith(("bool", "int", "uint", "float"))]
+    columns, found = [name for name in ["failure", *numbers] if NAME.fullmatch(name)], {}
+    content = Content(root, columns)
+    for name in sorted(set(columns) & set(content.frames)):
+        try:
+            found[name] = as_labels(content.frames[name], len(content), f"column {name!r} of {root}")
+        except LabelFileError:
+            if name == "failure":
+                raise
+    for name in specifications_of(root, repo_id):
+        if (sidecar := Sidecar.find(root, name, content, repo_id)) is not None:
+            found[name] = sidecar.failure
+    return found
 
 
 def as_labels(values: np.ndarray, n: int, source: str) -> np.ndarray:

@@ -10,11 +10,13 @@ def to_model_images(images: Tensor, size: int) -> Tensor:
     """What every path into a world model does to images: area-average to (size, size), round to 8 bits.
 
     Args:
-        images: (..., 3, H, W), uint8 or float in [0, 1].
+        images: (..., C, H, W), uint8 or float in [0, 1], of three channels or, if they are grey, of one.
 
     Returns:
         float (..., 3, size, size) in [0, 1].
     """
+    if images.shape[-3] == 1:
+        images = images.expand(*images.shape[:-3], 3, *images.shape[-2:])
     scale, images = (1.0, images.float()) if images.dtype == torch.uint8 else (255.0, images)
     if images.shape[-2:] != (size, size):
         rows, columns = (_averages(n, size).to(images) for n in images.shape[-2:])

@@ -8,11 +8,15 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
+from lerobot_latentsafe.datasets.adoption import adopt_dataset
 from lerobot_latentsafe.datasets.clips import Clip
+from lerobot_latentsafe.datasets.contract import Contract
 from lerobot_latentsafe.datasets.episodes import DatasetFrames
 from lerobot_latentsafe.latent import Latent, map_latent
 from lerobot_latentsafe.safety_model import SafetyModel
-from lerobot_latentsafe.units import adopt_dataset
+
+FRAMES_TOGETHER = 4096
+"""Of the episodes that are encoded side by side; a longer one is encoded alone."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +36,7 @@ def check_fit(model: SafetyModel, frames: DatasetFrames) -> None:
     """
     model.require_stage("world_model")
     trained_on = model.config.trained_on
-    adopt_dataset(trained_on, frames.meta, frames.meta.stats)
+    adopt_dataset(trained_on, Contract.read(frames.meta))
     missing = [camera for camera in trained_on.cameras if camera not in frames.cameras]
     if missing:
         raise ValueError(
@@ -63,11 +67,22 @@ def episode_margins(
         ValueError: the dataset is of another robot, rate or camera than the filter's.
     """
     check_fit(model, frames)
-    for first in range(0, len(frames.episodes), batch_size):
-        batch = frames.episodes[first : first + batch_size]
+    for batch in _batches(frames, batch_size):
         latents, length = encode_episodes(model, frames, batch)
         margin = model.imagination.margin(latents).detach().cpu().numpy()
         yield from zip(batch, (row[:n] for row, n in zip(margin, length)))
+
+
+def _batches(frames: DatasetFrames, batch_size: int) -> Iterator[list[int]]:
+    """Episodes in order, so many together, or fewer where they are long."""
+    batch: list[int] = []
+    for episode in frames.episodes:
+        longest = max(map(frames.length, [*batch, episode]))
+        if batch and (len(batch) == batch_size or (len(batch) + 1) * longest > FRAMES_TOGETHER):
+            yield batch
+            batch = []
+        batch.append(episode)
+    yield batch
 
 
 def encode_episodes(model: SafetyModel, frames: DatasetFrames, episodes: list[int]) -> tuple[Latent, list[int]]:
@@ -95,15 +110,21 @@ def encode_episodes(model: SafetyModel, frames: DatasetFrames, episodes: list[in
 
 def _model_inputs(model: SafetyModel, frames: DatasetFrames, episode: int) -> tuple[dict[str, Tensor], Tensor, Tensor]:
     """Percepts, proprioception and normalised actions of an episode, as the world model takes them."""
-    images = {
-        key: model.images(torch.from_numpy(frames.images(key, episode)).permute(0, 3, 1, 2).contiguous())
-        for key in model.world_model.image_keys
-    }
-    columns = frames.columns(episode, ["observation.state", "action"])
-    state, action = (torch.from_numpy(c).float().reshape(len(c), -1).to(model.device) for c in columns.values())
+    pieces = frames.pieces(model.world_model.image_keys, episode)
+    images = ({key: model.images(images) for key, images in piece.items()} for piece in pieces)
+    seen = [model.world_model.perceive(piece) for piece in images]
+    state, action = (numbers_of(frames, episode, key).to(model.device) for key in ("observation.state", "action"))
     units = model.units
     return (
-        model.world_model.perceive(images),
+        {name: torch.cat([piece[name] for piece in seen]) for name in seen[0]},
         units.normalise_state(state),
-        units.normalise_action(action).clamp(-1, 1),
+        units.heard_action(action, state),
     )
+
+
+def numbers_of(frames: DatasetFrames, episode: int, key: str) -> Tensor:
+    """The numbers of a feature in an episode: (T, D), or (T, 0) of a dataset without it."""
+    if key not in frames.meta.features:
+        return torch.zeros(frames.meta.episodes[episode]["length"], 0)
+    values = torch.from_numpy(frames.columns(episode, [key])[key]).float()
+    return values.reshape(len(values), -1)

@@ -4,13 +4,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_latentsafe.datasets.episodes import DatasetFrames
-from lerobot_latentsafe.evaluation.along_episodes import check_fit
+from lerobot_latentsafe.datasets.episodes import DatasetFrames, shrunk
+from lerobot_latentsafe.evaluation.along_episodes import check_fit, numbers_of
 from lerobot_latentsafe.latent import Latent
 from lerobot_latentsafe.safety_model import SafetyModel
 
 EPISODES, FRAMES = 40, 2000
 """Of a dataset, at most so many episodes and frames are put in, evenly spread."""
+SHOWN_ROWS = 240
+"""Rows of a picture that is kept to be shown."""
 
 
 class NearestFrames:
@@ -47,10 +49,12 @@ class NearestFrames:
         step = -(-min(EPISODES, total) * frames.meta.total_frames // (frames.meta.total_episodes * FRAMES))
         places = np.unique(np.linspace(0, total - 1, min(EPISODES, total)).round().astype(int))
         for episode in np.array(frames.episodes)[places].tolist():
-            images = {key: frames.images(key, episode)[::step] for key in self.model.world_model.image_keys}
-            state = torch.from_numpy(frames.columns(episode, ["observation.state"])["observation.state"][::step])
-            tensors = {key: torch.from_numpy(i).permute(0, 3, 1, 2).contiguous() for key, i in images.items()}
-            self.add(list(images[self.model.config.trained_on.cameras[0]]), tensors, state)
+            state = numbers_of(frames, episode, "observation.state")[::step]
+            numbers, at = range(0, frames.length(episode), step), 0
+            for images in frames.pieces(self.model.world_model.image_keys, episode, numbers):
+                shown = images[self.model.config.trained_on.cameras[0]].permute(0, 2, 3, 1).numpy()
+                self.add([shrunk(image, SHOWN_ROWS) for image in shown], images, state[at : at + len(shown)])
+                at += len(shown)
 
     @torch.no_grad()
     def nearest(self, latent: Latent) -> np.ndarray:

@@ -279,7 +279,7 @@ def _begun(infos: list[dict[str, Any]], pictures: list[np.ndarray]) -> Episodes:
 def _note_decision(runs: Episodes, decision: FilterDecision, alive: np.ndarray) -> None:
     _record(
         runs.traces, alive, proposed=decision.proposed, value=decision.value, margin=decision.margin,
-        intervened=decision.intervened, reason=decision.reason,
+        intervened=decision.intervened, reason=decision.reason, heard=decision.heard,
     )  # fmt: skip
     runs.overridden[alive & decision.intervened.cpu().numpy()] += 1
     moved = (decision.action - decision.proposed).norm(dim=-1).nan_to_num(0.0).cpu().numpy()

@@ -112,9 +112,7 @@ def imagined_episodes(
     start = model.world_model.observe(None, clip.action[kept, 0], percepts, clip.state[kept, 0])
     action, valid = clip.action[kept, 1:], clip.valid[kept, 1:]
     shuffled = torch.randperm(len(action), generator=generator)
-    still = torch.where(
-        model.units.frozen, clip.action[kept, :1], model.units.normalise_action(model.units.hold_action(1))
-    )
+    still = torch.where(model.units.frozen, clip.action[kept, :1], model.units.still)
     verdict = _fails(model, start, action, valid)
     return {
         "failing": int(failed.sum()),

@@ -33,7 +33,10 @@ STATIC = {
     "page.css": ("page.css", "text/css"),
 }
 MAX_BODY = 4096
-KEPT_EPISODES = 24
+PIECE = 32
+"""Frames that the page asks for together."""
+KEPT_BYTES = 256 * 2**20
+"""Of pictures, for pages that ask again."""
 HEADERS = {
     "Cache-Control": "no-store",
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
@@ -103,8 +106,8 @@ class LabelServer:
     def __init__(self, store: LabelStore, frames: DatasetFrames, user: str, suggester: Suggester | None = None):
         self.store, self.frames, self.user, self.suggester = store, frames, user, suggester
         self.changes: list[tuple[str | None, int]] = []
-        self._packed: OrderedDict[tuple[int, int], bytes] = OrderedDict()
-        self._packing = threading.Lock()
+        self._packed: OrderedDict[tuple, bytes] = OrderedDict()
+        self._keeping = threading.Lock()
 
     def app(self, token: str, hosts: set[str]) -> Guard:
         """The ASGI application."""
@@ -134,6 +137,7 @@ class LabelServer:
                 "identity": self.store.identity,
                 "fps": meta.fps,
                 "cameras": self.frames.cameras,
+                "piece": PIECE,
                 "lengths": self.store.length.tolist(),
                 "tasks": [", ".join(tasks) for tasks in meta.episodes["tasks"]],
                 "specifications": self.store.specifications,
@@ -171,10 +175,21 @@ class LabelServer:
         return self._changed(specification, undone[0]) if undone else JSONResponse({"entry": None})
 
     def episode_frames(self, request: Request) -> Response:
-        """All frames of one camera: the count, the size of each, then the pictures (little-endian uint32)."""
+        """Frames of one camera: the count, the size of each, then the pictures (little-endian uint32).
+
+        All of them; or with ?first=n&count=k so many from the n-th on; or with ?spread=k so many, evenly spread.
+        """
         camera = _number(request.path_params["camera"], "camera", len(self.frames.cameras) - 1)
         episode = _number(request.path_params["episode"], "episode", len(self.store) - 1)
-        return Response(self._pack(camera, episode), media_type="application/octet-stream")
+        length, asked = int(self.store.length[episode]), request.query_params
+        if "spread" in asked:
+            spread = _number(asked["spread"], "spread", length)
+            numbers = tuple(int((i + 0.5) * length / spread) for i in range(spread))
+        else:
+            first = _number(asked.get("first", 0), "first", length - 1)
+            count = _number(asked.get("count", length), "count", length)
+            numbers = tuple(range(first, min(first + count, length)))
+        return Response(self._pack(camera, episode, numbers), media_type="application/octet-stream")
 
     def margin(self, request: Request) -> Response:
         """The filter's margin along an episode, if it has judged it."""
@@ -208,17 +223,20 @@ class LabelServer:
             entry |= {"contradiction": round(contradiction(known.margin, labels), 3)}
         return entry
 
-    def _pack(self, camera: int, episode: int) -> bytes:
-        key = (camera, episode)
-        with self._packing:
-            if key not in self._packed:
-                pictures = self.frames.encoded(self.frames.cameras[camera], episode)
-                sizes = struct.pack(f"<{len(pictures) + 1}I", len(pictures), *map(len, pictures))
-                self._packed[key] = sizes + b"".join(pictures)
-                while len(self._packed) > KEPT_EPISODES * len(self.frames.cameras):
-                    self._packed.popitem(last=False)
-            self._packed.move_to_end(key)
-            return self._packed[key]
+    def _pack(self, camera: int, episode: int, numbers: tuple[int, ...]) -> bytes:
+        key = (camera, episode, numbers)
+        with self._keeping:
+            if key in self._packed:
+                self._packed.move_to_end(key)
+                return self._packed[key]
+        pictures = self.frames.encoded(self.frames.cameras[camera], episode, numbers)
+        sizes = struct.pack(f"<{len(pictures) + 1}I", len(pictures), *map(len, pictures))
+        packed = sizes + b"".join(pictures)
+        with self._keeping:
+            self._packed[key] = packed
+            while sum(map(len, self._packed.values())) > KEPT_BYTES:
+                self._packed.popitem(last=False)
+        return packed
 
 
 async def _body(request: Request) -> dict:

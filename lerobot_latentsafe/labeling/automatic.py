@@ -9,7 +9,7 @@ import importlib
 import json
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -45,10 +45,17 @@ class Episode:
             )
         return self.frames.columns(self.number, [name])[name]
 
+    def stream(self, camera: str, numbers: Sequence[int] | None = None) -> Iterator[np.ndarray]:
+        """Frames one after the other, uint8 (H, W, 3), RGB: those of these numbers, ascending from 0, or all."""
+        return self.frames.stream(camera, self.number, numbers)
+
     def images(self, camera: str) -> np.ndarray:
-        """uint8 (T, H, W, 3), RGB."""
+        """All frames at once, uint8 (T, H, W, 3), RGB; a long episode takes much memory, which `stream` does not."""
         return self.frames.images(camera, self.number)
 
+
+PATIENCE = 3
+"""Episodes in a row without an answer, after which a labeller is not asked again."""
 
 Labeller = Callable[[Episode], "int | np.ndarray | None"]
 
@@ -70,6 +77,10 @@ If you cannot tell, answer {{"fails": null, "first_failing_frame": null}}."""
 
 class AnswerError(ValueError):
     """A model's answer that is not exactly what was asked for; it never becomes a label."""
+
+
+class LabellerError(ValueError):
+    """A labeller that fails on every episode."""
 
 
 class Model(Protocol):
@@ -102,7 +113,7 @@ class VisionLanguageLabeller:
             shown=len(numbers), length=episode.length, camera=camera, task=episode.task,
             numbers=", ".join(map(str, numbers)), failure=self.failure,
         )  # fmt: skip
-        return parse_answer(self.model(prompt, list(episode.images(camera)[numbers])), episode.length)
+        return parse_answer(self.model(prompt, list(episode.stream(camera, numbers.tolist()))), episode.length)
 
 
 def parse_answer(answer: str, length: int) -> int | None:
@@ -186,29 +197,45 @@ def find_labeller(name: str) -> Labeller:
 def label_automatically(
     store: LabelStore, frames: DatasetFrames, specification: str, labeller: Labeller, name: str
 ) -> dict[str, list]:
-    """Ask a labeller about the episodes of `frames` that have no label yet, and save what it says.
+    """Ask a labeller about the episodes of `frames` that have no label yet; each answer is saved before the next.
+
+    Whatever ends it, what was answered is on disk, and another call goes on there.
 
     Returns:
-        labelled: episodes; undecided: episodes; refused: (episode, why) of answers that were no labels.
+        labelled: episodes; undecided: episodes; refused: (episode, why) of answers that were no labels; failed:
+        (episode, why) of those without an answer.
+
+    Raises:
+        LabellerError: so many episodes failed in a row that the next would, too.
+        OSError: an answer was not saved.
     """
     open_episodes = [e for e in frames.episodes if (store.labels(specification, e) == UNLABELLED).all()]
-    found = {}
-    result: dict[str, list] = {"labelled": [], "undecided": [], "refused": []}
+    result: dict[str, list] = {"labelled": [], "undecided": [], "refused": [], "failed": []}
+    in_a_row = 0
     for number in tqdm(open_episodes, desc=name, unit="episode"):
         length = int(store.length[number])
         episode = Episode(number, length, ", ".join(frames.meta.episodes[number]["tasks"]), frames)
         try:
             said = labeller(episode)
-            if said is None:
-                result["undecided"].append(number)
-                continue
-            found[number] = as_vector(said, length)
+            vector = None if said is None else as_vector(said, length)
         except AnswerError as e:
             result["refused"].append((number, str(e)))
+        except Exception as e:
+            result["failed"].append((number, f"{type(e).__name__}: {e}"))
+            in_a_row += 1
+            if in_a_row == PATIENCE or in_a_row == len(open_episodes):
+                raise LabellerError(
+                    f"{name} failed on {in_a_row} episodes in a row, last on episode {number} ({type(e).__name__}: {e})"
+                    f". The {len(result['labelled'])} labels it gave before are saved; the same command goes on there"
+                ) from e
             continue
-        result["labelled"].append(number)
-    if found:
-        store.label_frames(specification, found, f"auto {name}")
+        else:
+            if vector is None:
+                result["undecided"].append(number)
+            else:
+                store.label_frames(specification, {number: vector}, f"auto {name}")
+                result["labelled"].append(number)
+        in_a_row = 0
     return result
 
 

@@ -62,7 +62,7 @@ def write_disagreements(
         verdict, n = store.verdict(specification, d.episode), len(d.margin)
         said = np.select([d.failure == FAILING, d.failure == UNLABELLED], [-1.0, np.nan], 1.0)
         picked = np.unique(np.linspace(0, n - 1, PICTURES).round().astype(int))
-        images = frames.images(frames.cameras[0], d.episode)
+        images = list(frames.stream(frames.cameras[0], d.episode, picked))
         parts += [
             html.heading(f"Episode {d.episode}"),
             html.paragraph(
@@ -70,6 +70,6 @@ def write_disagreements(
                 f"Filter: {in_words(Suggestion.of(d.margin).guess, n)}."
             ),
             html.chart({"margin": d.margin, "label": said}, frames.meta.fps, said * d.margin < 0, 0.0, (-1.0, 1.0)),
-            html.strip([images[t] for t in picked], [f"frame {t}" for t in picked], [said[t] < 0 for t in picked]),
+            html.strip(images, [f"frame {t}" for t in picked], [said[t] < 0 for t in picked]),
         ]
     html.write_report(path, "Labels and filter disagree", parts)

@@ -5,6 +5,8 @@ it never fails, None that nobody has said. Every state of an episode carries the
 change names the state it was made on, so that two tabs cannot overwrite each other unseen.
 """
 
+import hashlib
+import logging
 import threading
 import time
 from collections import defaultdict
@@ -14,19 +16,20 @@ from pathlib import Path
 import numpy as np
 from filelock import FileLock, Timeout
 
+from lerobot_latentsafe.datasets.label_places import label_folders, sidecar_path, specifications_of
 from lerobot_latentsafe.datasets.labels import (
     FAILING,
-    FOLDER,
     SAFE,
     UNLABELLED,
+    Content,
     Sidecar,
-    UnlabelledDatasetError,
     as_labels,
-    identity,
-    read_frames,
-    sidecar_path,
-    specifications_of,
+    carry_hint,
+    labelled_nearby,
 )
+from lerobot_latentsafe.runtime.files import replacing
+
+logger = logging.getLogger(__name__)
 
 UNDO_DEPTH = 1000
 
@@ -55,7 +58,7 @@ class LabelStore:
     """All specifications of one dataset.
 
     Args:
-        root: the dataset's folder; labels go to `labels/` in it.
+        root: the dataset's folder; labels go to `labels/` in it, or to LeRobot's home (see `label_folders`).
         repo_id: its id, written into label files.
         specifications: names to offer besides those that have a file already.
 
@@ -66,14 +69,18 @@ class LabelStore:
 
     def __init__(self, root: str | Path, repo_id: str, specifications: list[str]):
         self.root, self.repo_id = Path(root), repo_id
-        paths = {name: sidecar_path(root, name) for name in (*specifications, *specifications_of(root))}
-        self.frames = read_frames(root, ["action", *paths])
-        self.identity = identity(self.frames, len(self.frames["index"]))
-        self.start, self.length = _episode_spans(self.frames)
+        names = [*specifications, *specifications_of(root, repo_id)]
+        self._paths = {name: sidecar_path(root, name, repo_id) for name in names}
+        self.content = Content(root, self._paths)
+        self.identity, (self.start, self.length) = self.content.identity, self.content.spans
         self._lock = threading.RLock()
         self._undo: dict[tuple[str, str], list] = defaultdict(list)
-        self._files = {name: self._open(name, path) for name, path in paths.items()}
-        self._guard = self._own_folder()
+        self._guard = own_folder(label_folders(root, repo_id)[0], self.root)
+        try:  # what another process saved until now is read, and nothing that it still would
+            self._files = {name: self._open(name, path) for name, path in self._paths.items()}
+        except BaseException:
+            self._guard.release()
+            raise
 
     @property
     def specifications(self) -> list[str]:
@@ -84,37 +91,31 @@ class LabelStore:
         return len(self.length)
 
     def _open(self, name: str, path: Path) -> Sidecar:
-        if path.exists():
-            return Sidecar.read(path, self.frames)
-        sidecar = Sidecar.empty(len(self.frames["index"]))
-        if name in self.frames:
-            # What the dataset says already is where labelling starts.
-            sidecar.failure = as_labels(self.frames[name], len(sidecar.failure), f"column {name!r} of {self.root}")
-            sidecar.names, sidecar.by[sidecar.failure != UNLABELLED] = [f"column {name}"], 0
-        return sidecar
+        """Labels that there are, carried to where new ones go."""
+        found = Sidecar.find(self.root, name, self.content, self.repo_id)
+        if found is None:
+            return self._of_column(name)
+        if not path.exists():
+            found.write(path, self.repo_id, self.content)
+            logger.warning("the labels %r of %s were carried over to %s", name, self.repo_id, path)
+        elif found.left:
+            aside = _keep_aside(path)
+            found.write(path, self.repo_id, self.content)
+            logger.warning(
+                "%s has labels of %d episodes that this dataset lacks or that look alike; they are kept in %s, and "
+                "the labels of all other episodes were carried over", path, found.left, aside,
+            )  # fmt: skip
+        return found
 
-    def _own_folder(self) -> FileLock:
-        """Make `labels/`, prove that it can be written, and keep other processes out."""
-        folder = self.root / FOLDER
-        try:
-            folder.mkdir(exist_ok=True)
-            for torn in folder.glob(".*.partial"):
-                torn.unlink()
-            probe = folder / ".probe"
-            probe.write_bytes(b"")
-            probe.unlink()
-            lock = FileLock(folder / ".lock")
-            lock.acquire(timeout=0)
-        except Timeout:
-            raise OSError(
-                f"another process is labelling {self.root} already; close it, or use its page in another tab"
-            ) from None
-        except OSError as e:
-            raise OSError(
-                f"cannot write labels to {folder} ({e.strerror or e}); make it writable, or copy the dataset to a "
-                "folder of your own. Nothing was changed"
-            ) from e
-        return lock
+    def _of_column(self, name: str) -> Sidecar:
+        """What the dataset says already is where labelling starts."""
+        sidecar, frames = Sidecar.empty(len(self.content)), self.content.frames
+        if name in frames:
+            sidecar.failure = as_labels(frames[name], len(sidecar.failure), f"column {name!r} of {self.root}")
+            sidecar.names, sidecar.by[sidecar.failure != UNLABELLED] = [f"column {name}"], 0
+        elif near := labelled_nearby(name, self.content):
+            logger.warning("%s has no labels %r yet. %s", self.repo_id, name, carry_hint(near))
+        return sidecar
 
     def close(self) -> None:
         """Let other processes label."""
@@ -178,6 +179,26 @@ class LabelStore:
                 sidecar.failure, sidecar.by, sidecar.at = saved
                 raise
 
+    def take(self, specification: str, labels: Sidecar) -> int:
+        """Take over another file's labels on the same frames, where they are later, and save.
+
+        Returns:
+            How many episodes have other labels than before.
+
+        Raises:
+            OSError: not saved; the labels are as before, in memory and on disk.
+        """
+        with self._lock:
+            before = self._files[specification]
+            self._files[specification] = after = before.updated(labels)
+            try:
+                self._save(specification)
+            except BaseException:
+                self._files[specification] = before
+                raise
+            spans = map(self._span, range(len(self)))
+            return sum(not np.array_equal(before.failure[span], after.failure[span]) for span in spans)
+
     def undo(self, specification: str, tab: str = "") -> tuple[int, Verdict] | None:
         """Take back the tab's last change; None if there is none.
 
@@ -226,8 +247,53 @@ class LabelStore:
         sidecar.at[span] = max(time.time_ns() // 1000, int(sidecar.at.max()) + 1) if at is None else at
 
     def _save(self, specification: str) -> None:
-        path = sidecar_path(self.root, specification)
-        self._files[specification].write(path, self.repo_id, self.identity)
+        self._files[specification].write(self._paths[specification], self.repo_id, self.content)
+
+
+def own_folder(folder: Path, root: Path) -> FileLock:
+    """Make a folder for labels, keep other processes out, and prove that it can be written.
+
+    Nothing in it is touched while another process has it.
+
+    Raises:
+        OSError: another process has it, or it cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(folder / ".lock")
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise OSError(
+            f"another process is labelling {root} already; close it, or use its page in another tab"
+        ) from None
+    except OSError as e:
+        raise OSError(_cannot_write(folder, e)) from e
+    try:
+        for torn in folder.glob(".*.partial"):
+            torn.unlink()
+        probe = folder / ".probe"
+        probe.write_bytes(b"")
+        probe.unlink()
+    except OSError as e:
+        lock.release()
+        raise OSError(_cannot_write(folder, e)) from e
+    return lock
+
+
+def _cannot_write(folder: Path, error: OSError) -> str:
+    return (
+        f"cannot write labels to {folder} ({error.strerror or error}); make it writable, or copy the dataset to a "
+        "folder of your own. Nothing was changed"
+    )
+
+
+def _keep_aside(path: Path) -> Path:
+    """A copy of a label file under a name that tells its content, such as failure.1f2e3d4c.parquet."""
+    content = path.read_bytes()
+    aside = path.with_name(f"{path.stem}.{hashlib.sha256(content).hexdigest()[:8]}{path.suffix}")
+    with replacing(aside) as partial:
+        partial.write_bytes(content)
+    return aside
 
 
 def first_failing(failure: np.ndarray) -> int | None:
@@ -235,15 +301,3 @@ def first_failing(failure: np.ndarray) -> int | None:
     first = int((failure == SAFE).sum())
     ordered = (failure[:first] == SAFE).all() and (failure[first:] == FAILING).all()
     return first if ordered else None
-
-
-def _episode_spans(frames: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """First frame index and length of each episode."""
-    episode = frames["episode_index"]
-    start = np.flatnonzero(np.r_[True, episode[1:] != episode[:-1]])
-    if not np.array_equal(episode[start], np.arange(len(start))):
-        raise UnlabelledDatasetError(
-            f"episodes are numbered {episode[start][:5].tolist()}...; expected 0, 1, 2, ...: an episode file is "
-            "missing. Download or restore the whole dataset"
-        )
-    return start, np.diff(np.r_[start, len(episode)])

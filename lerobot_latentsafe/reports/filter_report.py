@@ -245,9 +245,7 @@ def _feared(
     if not len(acted):
         return [html.paragraph("The filter never saw a reason to act here.")]
     first = int(acted[0])
-    wanted = policy.model.units.normalise_action(
-        torch.tensor([trace["proposed"][first]], device=policy.model.device)
-    ).clamp(-1, 1)
+    wanted = torch.tensor([trace["heard"][first]], device=policy.model.device)
     said = f"What the filter imagined when it first acted, {first / fps:.2f} s into the episode:"
     if seen is not None:
         said += (

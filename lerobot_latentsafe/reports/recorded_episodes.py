@@ -1,6 +1,9 @@
 """What `latentsafe record` stored under a filter, read back as episodes that a report can show."""
 
+from collections.abc import Iterator, Sequence
+
 import numpy as np
+import torch
 
 from lerobot_latentsafe.datasets.decisions import FILE, decision_columns
 from lerobot_latentsafe.datasets.episodes import DatasetFrames
@@ -11,12 +14,28 @@ from lerobot_latentsafe.latent import map_latent
 from lerobot_latentsafe.safety_model import SafetyModel
 
 
+class Pictures(Sequence):
+    """One camera's frames of an episode, decoded whenever somebody looks at them."""
+
+    def __init__(self, frames: DatasetFrames, camera: str, episode: int):
+        self.frames, self.camera, self.episode = frames, camera, episode
+
+    def __len__(self) -> int:
+        return self.frames.length(self.episode)
+
+    def __getitem__(self, t: int) -> np.ndarray:
+        return next(self.frames.stream(self.camera, self.episode, [range(len(self))[t]]))
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        return self.frames.stream(self.camera, self.episode)
+
+
 class RecordedEpisodes:
     """A dataset with the shield's decisions beside it, or some episodes of one.
 
     Attributes:
         episode: (N,) of each frame.
-        executed: (N, A) the action of each frame.
+        state, executed: (N, S) and (N, A), of each frame.
         decisions: proposed (N, A), value, margin, intervened, reason (N,) of each frame; see `decision_columns`.
 
     Raises:
@@ -26,10 +45,10 @@ class RecordedEpisodes:
     def __init__(self, model: SafetyModel, frames: DatasetFrames):
         check_fit(model, frames)
         self.model, self.frames = model, frames
-        stored = read_frames(frames.root, ["frame_index", "action"])
+        stored = read_frames(frames.root, ["frame_index", "action", "observation.state"])
         meant = np.isin(stored["episode_index"], frames.episodes)
         stored = {name: column[meant] for name, column in stored.items()}
-        self.episode, self.executed = stored["episode_index"], stored["action"]
+        self.episode, self.executed, self.state = (stored[k] for k in ("episode_index", "action", "observation.state"))
         self.decisions = decision_columns(frames.root / FILE, stored)
 
     @staticmethod
@@ -41,12 +60,14 @@ class RecordedEpisodes:
         """One episode; whether it succeeded or failed is not known here, and stands as no."""
         rows, no = self.episode == episode, np.zeros(1, bool)
         trace = {name: column[rows].tolist() for name, column in self.decisions.items()}
+        proposed, state = (torch.from_numpy(x[rows]).float() for x in (self.decisions["proposed"], self.state))
+        trace["heard"] = self.model.units.heard_action(proposed, state).tolist()
         change = np.linalg.norm(self.executed[rows] - self.decisions["proposed"][rows], axis=-1)
         latents, (length,) = encode_episodes(self.model, self.frames, [episode])
         return Episodes(
             success=no, violation=no, steps=np.array([length]), overridden=np.array([sum(trace["intervened"])]),
             action_change=np.array([change.sum()]), severity=np.full(1, np.nan),
             traces=[{**trace, "action": self.executed[rows].tolist()}],
-            frames=[list(self.frames.images(self.model.config.trained_on.cameras[0], episode))],
+            frames=[Pictures(self.frames, self.model.config.trained_on.cameras[0], episode)],
             latents=[[map_latent(latents, lambda z, t=t: z[:, t]) for t in range(length)]],
         )  # fmt: skip

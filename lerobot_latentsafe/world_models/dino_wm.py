@@ -297,7 +297,7 @@ class DinoWM(TerminationHead):
     def _unit_of_change(self, frames: dict[str, Tensor], goes_on: Tensor) -> dict[str, Tensor]:
         """Mean squared change from one frame to the next, of each camera's tokens (cameras,) and of state ()."""
         tokens, state = (torch.diff(frames[name], dim=1) for name in ("tokens", "state"))
-        change = {"tokens": self._by_camera(tokens).mean(-2), "state": state.square().mean(-1)}
+        change = {"tokens": self._by_camera(tokens).mean(-2), "state": _mean_square(state)}
         return {name: mean_over_ranks(_mean(value, goes_on)).clamp(min=1e-6) for name, value in change.items()}
 
     def _errors(
@@ -313,7 +313,7 @@ class DinoWM(TerminationHead):
             since: the frames, N or one, since which a token's change makes it weigh.
         """
         truth = {name: frames[name][:, -tokens.shape[1] :] for name in ("tokens", "state")}
-        errors = {"state": _mean((state - truth["state"]).square().mean(-1), counts) / unit["state"]}
+        errors = {"state": _mean(_mean_square(state - truth["state"]), counts) / unit["state"]}
         if not self.config.blind:
             weight = self._weight(self._by_camera(truth["tokens"] - frames["tokens"][:, since]), counts)
             error = (self._by_camera(tokens - truth["tokens"]) * weight).mean(-2)
@@ -332,6 +332,11 @@ class DinoWM(TerminationHead):
 def _like(mask: Tensor, x: Tensor) -> Tensor:
     """A mask (B, N) with the axes of x (B, N, ...)."""
     return mask.reshape(*mask.shape, *[1] * (x.ndim - 2))
+
+
+def _mean_square(x: Tensor) -> Tensor:
+    """Of the last axis, which may be empty: 0 then."""
+    return x.square().sum(-1) / max(1, x.shape[-1])
 
 
 def _mean(x: Tensor, counts: Tensor) -> Tensor:

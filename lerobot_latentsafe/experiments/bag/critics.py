@@ -84,7 +84,7 @@ def planned(model: SafetyModel, latent: Latent) -> Tensor:
 
 def _hold(model: SafetyModel) -> Tensor:
     """Holding still, (1, A) in [-1, 1]."""
-    return model.units.normalise_action(model.units.hold_action(1))
+    return model.units.still
 
 
 def score(value: Tensor, truth: Tensor, epsilon: float) -> dict[str, float]:

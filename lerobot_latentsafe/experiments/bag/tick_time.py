@@ -37,7 +37,8 @@ class TimedShield:
 
     def __init__(self, policy: LatentSafePolicy, alone: bool):
         policy.reset()
-        self.policy, self.alone, self.moving = policy, alone, policy.model.units.hold_action(1)
+        units = policy.model.units
+        self.policy, self.alone, self.moving = policy, alone, units.denormalise_action(units.still)
         self.ticks: list[float] = []
 
     @torch.no_grad()

@@ -20,17 +20,17 @@ from lerobot.optim.optimizers import load_optimizer_state, save_optimizer_state
 from torch import Tensor
 
 from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
+from lerobot_latentsafe.datasets.adoption import adopt_dataset
 from lerobot_latentsafe.datasets.clips import Clip
 from lerobot_latentsafe.experiments.blocks.cuda_graph import Replayed
 from lerobot_latentsafe.experiments.blocks.recorders import Recorders, number
-from lerobot_latentsafe.experiments.blocks.replay import CAMERA_KEYS, Replay, described, export
+from lerobot_latentsafe.experiments.blocks.replay import CAMERA_KEYS, Replay, export
 from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES
 from lerobot_latentsafe.policies.dreamer.configuration_dreamer import LatentSafeDreamerConfig
 from lerobot_latentsafe.policies.dreamer.modeling_dreamer import LatentSafeDreamerPolicy
 from lerobot_latentsafe.runtime.hub import save_policy
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
 from lerobot_latentsafe.safety_model import SafetyModel
-from lerobot_latentsafe.units import adopt_dataset
 
 OPTIONS, LOG = "options.json", "log.jsonl"
 
@@ -269,14 +269,15 @@ class DreamerTraining:
         options = self.options
         torch.manual_seed(number(options.seed, 0, 0))
         config, shape = options.model, (3, self.scene.image_size, self.scene.image_size)
-        known = replace(config.trained_on, cameras=list(CAMERA_KEYS), task=self.scene.task)
+        other = {"gripper.pos": "other"}  # the actor commands a width, not by how much the fingers move
+        known = replace(config.trained_on, cameras=list(CAMERA_KEYS), task=self.scene.task, meanings=other)
         config.change(
             input_features={
                 **{key: PolicyFeature(FeatureType.VISUAL, shape) for key in CAMERA_KEYS},
                 "observation.state": PolicyFeature(FeatureType.STATE, (len(STATE_NAMES),)),
             },
             output_features={"action": PolicyFeature(FeatureType.ACTION, (len(ACTION_NAMES),))},
-            trained_on=adopt_dataset(known, described(self.scene.fps), self.replay.statistics(options.demonstrations)),
+            trained_on=adopt_dataset(known, self.replay.contract(options.demonstrations, self.scene.fps)),
         )
         self._train(LatentSafeDreamerPolicy(options.policy, SafetyModel(config).to(config.device)), 0)
 

@@ -4,7 +4,6 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import torch
@@ -13,6 +12,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_latentsafe.datasets.build_cache import write_manifest
 from lerobot_latentsafe.datasets.clips import ClipReader
+from lerobot_latentsafe.datasets.contract import Contract
 from lerobot_latentsafe.datasets.frame_cache import FOLDER, FrameCache
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE, FailureLabels
 from lerobot_latentsafe.encoders.pictures import to_model_images
@@ -128,24 +128,25 @@ class Replay:
         cache = FrameCache({**self.percepts}, {}, self.arrays["state"], self.arrays["action"], {})
         return ClipReader(labels, cache, clip_length, units)
 
-    def statistics(self, n_episodes: int) -> dict[str, dict[str, np.ndarray]]:
-        """What LeRobot's dataset statistics say of the first so many episodes' actions and states."""
-        state, action = (self.arrays[name][: n_episodes * self.length] for name in ("state", "action"))
-        return {
-            "action": {"min": action.min(0), "max": action.max(0)},
-            "observation.state": {"mean": state.mean(0), "std": state.std(0)},
-        }
+    def contract(self, n_episodes: int, fps: int) -> Contract:
+        """What a dataset of the first so many episodes would say of its robot."""
+        n, side = n_episodes * self.length, self.arrays[CAMERA_KEYS[0]].shape[-1]
+        state, action = (np.array(self.arrays[name][:n]) for name in ("state", "action"))
+        cameras = dict.fromkeys(CAMERA_KEYS, (3, side, side))
+        episode = np.repeat(np.arange(n_episodes), self.length)
+        return Contract(
+            "the replay", Path(), LatentSafeFrankaMujoco.name, fps, STATE_NAMES, ACTION_NAMES, cameras, {}, episode,
+            state, action,
+        )  # fmt: skip
 
 
-def described(fps: int) -> SimpleNamespace:
-    """What LeRobot's metadata would say of a replay's columns."""
-    features = {
-        "observation.state": {"dtype": "float32", "shape": (len(STATE_NAMES),), "names": STATE_NAMES},
-        "action": {"dtype": "float32", "shape": (len(ACTION_NAMES),), "names": ACTION_NAMES},
-        "failure": {"dtype": "int64", "shape": (1,), "names": None},
-        "next.done": {"dtype": "bool", "shape": (1,), "names": None},
-    }
-    return SimpleNamespace(repo_id="the replay", robot_type=LatentSafeFrankaMujoco.name, fps=fps, features=features)
+COLUMNS = {
+    "observation.state": {"dtype": "float32", "shape": (len(STATE_NAMES),), "names": STATE_NAMES},
+    "action": {"dtype": "float32", "shape": (len(ACTION_NAMES),), "names": ACTION_NAMES},
+    "failure": {"dtype": "int64", "shape": (1,), "names": None},
+    "next.done": {"dtype": "bool", "shape": (1,), "names": None},
+}
+"""LeRobot's features of a replay, without the cameras."""
 
 
 def export(replay: Replay, n_episodes: int, root: Path, repo_id: str, scene: FrankaScene) -> None:
@@ -170,9 +171,8 @@ def export(replay: Replay, n_episodes: int, root: Path, repo_id: str, scene: Fra
 
 def _write_dataset(replay: Replay, n_episodes: int, root: Path, repo_id: str, scene: FrankaScene) -> None:
     """All but the pictures."""
-    columns = described(scene.fps)
     dataset = LeRobotDataset.create(
-        repo_id, scene.fps, columns.features, root=root, robot_type=columns.robot_type, use_videos=False,
+        repo_id, scene.fps, dict(COLUMNS), root=root, robot_type=LatentSafeFrankaMujoco.name, use_videos=False,
         metadata_buffer_size=100,
     )  # fmt: skip
     for t in range(n_episodes * replay.length):

@@ -4,7 +4,7 @@
 const $ = id => document.getElementById(id);
 const style = getComputedStyle(document.documentElement); // read once: asking again makes the browser lay out the page
 const COLOUR = Object.fromEntries(["line", "text", "dim", "safe", "fail", "guess"].map(name => [name, style.getPropertyValue(`--${name}`).trim()]));
-const THUMBS = 16, AHEAD = 3, KEPT = 8, POLL_MS = 1500, SPEEDS = [0.25, 0.5, 1, 2, 4, 8];
+const THUMBS = 16, AHEAD = 3, NEAR = 8, NEAR_AHEAD = 2, KEPT = 64, POLL_MS = 1500, SPEEDS = [0.25, 0.5, 1, 2, 4, 8];
 
 let dataset, specification, entries = [], order = [], current = -1, frame = 0, changes = 0;
 let playing = 0, speed = 2, margin = null, online = true;
@@ -134,41 +134,77 @@ async function undo() {
   toast(`Undone: episode ${entry.episode}.`);
 }
 
-// -- frames: whole episodes are fetched ahead, pictures decoded when they are shown ---
+// -- frames: a piece of an episode is fetched when it is shown or near, pictures are decoded when they are shown ---
 
-const fetched = new Map(); // episode -> promise of [camera][frame] blobs
+const pieces = new Map(); // "episode:piece" -> promise of [camera][frame] blobs, the last used at the end
+const pieceOf = index => Math.floor(index / dataset.piece);
 
-function pictures(episode) {
-  if (!fetched.has(episode)) {
-    fetched.set(episode, Promise.all(dataset.cameras.map((_, camera) => unpack(camera, episode))));
-    fetched.get(episode).catch(() => fetched.delete(episode));
-    for (const old of [...fetched.keys()].slice(0, -KEPT)) if (old !== current) fetched.delete(old);
-  }
-  return fetched.get(episode);
+function piece(episode, place) {
+  const key = `${episode}:${place}`, range = `first=${place * dataset.piece}&count=${Math.min(dataset.piece, length(episode))}`;
+  const found = pieces.get(key) ?? Promise.all(dataset.cameras.map((_, camera) => load(camera, episode, range)));
+  found.catch(() => pieces.delete(key));
+  pieces.delete(key);
+  pieces.set(key, found);
+  if (pieces.size > KEPT) pieces.delete(pieces.keys().next().value);
+  return found;
 }
 
-async function unpack(camera, episode) {
-  const content = await (await call(`frames/${camera}/${episode}`)).arrayBuffer();
+async function pictures(episode, index) { // one blob a camera
+  return (await piece(episode, pieceOf(index))).map(camera => camera[index % dataset.piece]);
+}
+
+async function load(camera, episode, asked) {
+  const content = await (await call(`frames/${camera}/${episode}?${asked}`)).arrayBuffer();
   const sizes = new Uint32Array(content.slice(0, 4 * (1 + new DataView(content).getUint32(0, true))));
   let at = 4 * sizes.length;
   return Array.from(sizes.slice(1), size => new Blob([content.slice(at, at += size)]));
 }
 
-function fetchAhead() {
-  let episode = current;
-  for (let i = 0; i < AHEAD; i++) {
-    episode = nextOpen(episode);
-    if (episode < 0) return;
-    pictures(episode).catch(() => {});
+function missing(episode, index, far) { // the nearest piece that is not there yet; null: all are
+  const here = pieceOf(index), last = pieceOf(length(episode) - 1);
+  for (let off = 0; off <= far; off++) {
+    for (const place of [here + off, here - off]) {
+      if (place >= 0 && place <= last && !pieces.has(`${episode}:${place}`)) return [episode, place];
+    }
   }
+  return null;
 }
 
-let wanted = 0;
-async function draw() {
-  const mine = ++wanted, [episode, index] = [current, frame];
-  const blobs = await pictures(episode);
-  const images = await Promise.all(blobs.map(camera => createImageBitmap(camera[index])));
-  if (mine !== wanted) return;
+function next() { // what to fetch while nothing is asked for: around the frame, then where the next episodes will open
+  let wanted = missing(current, frame, NEAR), episode = current;
+  for (let i = 0; i < AHEAD && !wanted; i++) {
+    episode = nextOpen(episode);
+    if (episode < 0) return null;
+    wanted = missing(episode, opensAt(episode), NEAR_AHEAD);
+  }
+  return wanted;
+}
+
+let fetching = false;
+async function fetchAhead() {
+  if (fetching) return;
+  fetching = true;
+  try { for (let wanted; (wanted = next());) await piece(...wanted); } catch { /* asked for again when it is shown */ }
+  fetching = false;
+}
+
+let wanted = 0, drawing = null;
+function draw() { // one picture after the other, always the latest: what was passed over is not fetched
+  wanted++;
+  return drawing ??= drawLatest().finally(() => { drawing = null; });
+}
+
+async function drawLatest() {
+  let mine;
+  do {
+    mine = wanted;
+    try { await show(current, frame); } catch (error) { if (mine === wanted) throw error; }
+  } while (mine !== wanted);
+}
+
+async function show(episode, index) {
+  const images = await Promise.all((await pictures(episode, index)).map(blob => createImageBitmap(blob)));
+  if (episode !== current) return;
   document.querySelectorAll("#cameras canvas").forEach((canvas, i) => {
     const { width, height } = images[i];
     if (canvas.width !== width || canvas.height !== height) {
@@ -185,6 +221,7 @@ async function draw() {
 // -- opening and ordering episodes ---
 
 const length = episode => dataset.lengths[episode];
+const opensAt = episode => Math.min(entries[episode].first ?? entries[episode].guess ?? 0, length(episode) - 1);
 const isOpen = episode => entries[episode].first === null && !entries[episode].mixed;
 
 function arrange() {
@@ -214,7 +251,7 @@ async function open(episode) {
   const row = rowOf(episode), entry = entries[episode];
   row.setAttribute("aria-current", "true");
   row.scrollIntoView({ block: "nearest" });
-  frame = Math.min(entry.first ?? entry.guess ?? 0, length(episode) - 1);
+  frame = opensAt(episode);
   sessionStorage.episode = episode;
   $("view").dataset.episode = episode;
   document.querySelector("#title b").textContent = `Episode ${episode}`;
@@ -225,9 +262,9 @@ async function open(episode) {
   $("film").getContext("2d").clearRect(0, 0, $("film").width, $("film").height);
   if (entry.guess !== undefined) loadMargin(episode);
   try {
-    await pictures(episode);
+    await pictures(episode, frame);
     if (current !== episode) return;
-    drawFilm(episode);
+    await drawFilm(episode);
     fetchAhead();
   } catch (error) {
     if (error.status) toast(`Episode ${episode} cannot be shown: ${error.message}.`); else lost(error);
@@ -380,18 +417,27 @@ function drawTimeline() {
   c.fillRect((frame + 0.5) * step - 1, 0, 2, height);
 }
 
+let film = {}; // of the episode whose thumbnails were fetched last
 async function drawFilm(episode) {
-  const [film] = await pictures(episode), n = length(episode);
-  const [c, width, height] = fit($("film"));
-  const count = Math.min(THUMBS, n), each = width / count;
+  const n = length(episode), count = Math.min(THUMBS, n);
+  if (film.episode !== episode) film = { episode, thumbs: thumbnails(episode, count) };
+  const thumbs = await film.thumbs.catch(error => { film = {}; throw error; });
+  if (current !== episode) return;
+  const [c, width, height] = fit($("film")), each = width / count;
   for (let i = 0; i < count; i++) {
-    const image = await createImageBitmap(film[Math.floor((i + 0.5) * n / count)]);
+    const image = await createImageBitmap(thumbs[i]);
     if (current !== episode) return;
     const scale = Math.max((each - 2) / image.width, height / image.height);
     const [w, h] = [(each - 2) / scale, height / scale];
     c.drawImage(image, (image.width - w) / 2, (image.height - h) / 2, w, h, i * each, 0, each - 2, height);
     image.close();
   }
+}
+
+function thumbnails(episode, count) { // of a short episode, which is fetched whole anyway, its own pictures
+  const n = length(episode);
+  if (pieceOf(n - 1) > NEAR_AHEAD) return load(0, episode, `spread=${count}`);
+  return Promise.all(Array.from({ length: count }, async (_, i) => (await pictures(episode, Math.floor((i + 0.5) * n / count)))[0]));
 }
 
 // -- moving through time ---
@@ -401,6 +447,7 @@ function go(to) {
   showFrame();
   drawTimeline();
   draw().catch(() => {});
+  fetchAhead();
 }
 
 function stop() { clearInterval(playing); playing = 0; }
@@ -500,7 +547,7 @@ async function start() {
 }
 
 addEventListener("keydown", press);
-addEventListener("resize", () => { if (current >= 0) { drawTimeline(); drawFilm(current); } });
+addEventListener("resize", () => { if (current >= 0) { drawTimeline(); drawFilm(current).catch(() => {}); } });
 addEventListener("beforeunload", event => { if (waiting.length) event.preventDefault(); });
 document.querySelectorAll("button[data-key]").forEach(button => { button.onclick = () => press(new KeyboardEvent("keydown", { key: button.dataset.key })); });
 $("help-button").onclick = () => $("help").showModal();

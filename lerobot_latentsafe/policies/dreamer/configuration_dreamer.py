@@ -23,7 +23,7 @@ class LatentSafeDreamerConfig(PreTrainedConfig):
     world_model_path: str | None = None
     task: str | None = None
     cameras: list[str] | None = None
-    fps: int | None = None
+    fps: float | None = None
     state_names: list[str] | None = None
     action_names: list[str] | None = None
 

@@ -84,13 +84,19 @@ class LatentSafeDreamerPolicy(PreTrainedPolicy):
         percepts, state = model.see(batch)
         first = self.latent is None
         if first:  # what the fingers do is known of every frame that was learned from, so it must be of this one
-            self.executed = units.first_action(units.normalise_action(units.commands_seen(state)).nan_to_num(0.0))
+            self.executed = units.first_action(self._seen_commands(batch))
         self.latent = model.world_model.observe(self.latent, self.executed, percepts, state)
         features = model.world_model.features(self.latent)
         self.executed = self.actor.sample(features).clamp(-1, 1) if explore else self.actor.mode(features)
         if first:  # what counts as having led to the first frame depends on its action, see `first_action`
             self.latent = model.world_model.observe(None, units.first_action(self.executed), percepts, state)
         return units.denormalise_action(self.executed)
+
+    def _seen_commands(self, batch: dict[str, Tensor]) -> Tensor:
+        """What the state shows of commands of the same name: (B, A), inside; zero of others."""
+        units = self.model.units
+        shown = units.seen(self.model.place(batch["observation.state"]).float())
+        return units.normalise_action(shown.clamp(units.action_low, units.action_high)).nan_to_num(0.0)
 
     def was_overridden(self, executed: Tensor) -> None:
         """Remember what was done, (B, A) in robot units, instead of what was chosen."""

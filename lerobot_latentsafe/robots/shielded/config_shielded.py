@@ -44,7 +44,8 @@ class LatentSafeShieldedConfig(RobotConfig):
         fps: rate of the loop that drives it, if known beforehand: it must be the filter's.
         unfiltered_moves: let pass what moves the robot between episodes (LeRobot's return of an arm to its start, a
             person's resets), and commands of which the filter knows nothing, such as joint moves. Otherwise the first
-            are filtered like any other, and at the others the robot holds still.
+            are filtered like any other, and at the others the robot holds still. Where commands are joint targets,
+            what moves the robot between episodes passes anyway, but no joint goes further at once than in the data.
         journal: a parquet file for every decision of a recording; `latentsafe record` sets it.
     """
 

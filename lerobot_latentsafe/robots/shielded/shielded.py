@@ -51,6 +51,7 @@ class LatentSafeShielded(Robot):
 
     _phase: int | str | None
     _decided_at: float | None
+    _untaken: dict[str, float] | None
 
     def __init__(self, config: LatentSafeShieldedConfig):
         super().__init__(config)
@@ -64,8 +65,6 @@ class LatentSafeShielded(Robot):
         self.journal = Journal(config.journal) if config.journal else None
         self._events = LeRobotEvents()
         self._sent: dict[str, float] = {}
-        self._sent_early: dict[str, float] | None = None
-        self._early = False
         self._forget()
 
     def _check_fit(self) -> None:
@@ -163,44 +162,30 @@ class LatentSafeShielded(Robot):
         Returns:
             What was executed.
         """
-        early = self._sent_early
-        self._sent_early = None
-        if early is not None and action == early:
-            return early
         shield, names = self.filter.shield, self._trained_on.action_names
         before = shield.decision
         sent = self.inner.send_action(self._decide(action))
         self._sent.update(sent)
+        self._untaken = dict(sent)
         if self.journal and shield.decision is not None and shield.decision is not before:
             self.journal.add(shield.decision, [float(sent[name]) for name in names])
         if set(sent) == set(names) and shield.executed is not None:  # the robot may have clipped it
             shield.was_executed(torch.tensor([[float(sent[name]) for name in names]], device=self.filter.model.device))
         return sent
 
-    def send_early(self, action: dict[str, float]) -> dict[str, float]:
-        """Like `send_action`; a `send_action` of the result that follows has nothing left to do.
-
-        Raises:
-            ValueError: not the robot's action names; nothing was sent.
-        """
-        if set(action) != set(self.action_features):
-            raise ValueError(
-                f"the operator commands {', '.join(action)}; {self.name} takes {', '.join(self.action_features)}. "
-                "Nothing was sent; use a teleoperator of this robot"
-            )
-        self._early, self._sent_early = True, None
-        sent = self.send_action(action)
-        self._sent_early = dict(sent)
-        return dict(sent)
+    def take_sent(self) -> dict[str, float] | None:
+        """What was executed since this was asked last, if anything: for whoever stores it."""
+        sent, self._untaken = self._untaken, None
+        return sent
 
     def _decide(self, action: dict[str, float]) -> dict[str, float]:
         """What is to be executed instead of an action, or that action itself."""
         names, shield, period = self._trained_on.action_names, self.filter.shield, 1.0 / self._trained_on.fps
         known = set(action) == set(names)
-        if self.config.unfiltered_moves and (self._between or not known) and all(map(math.isfinite, action.values())):
-            self._say_once("moves between episodes, or of other names, are not filtered (--robot.unfiltered_moves)")
-            self._decided_at = -math.inf
-            return action
+        passes = self.config.unfiltered_moves and (self._between or not known)
+        if (passes or (self._between and self._goes_to_places(action))) and all(map(math.isfinite, action.values())):
+            self._say_once("moves between episodes, or of other names, are not filtered; no joint may jump")
+            return self._bounded(action)
         if not known:
             return self._hold(action)
         if not self._fresh:
@@ -221,18 +206,37 @@ class LatentSafeShielded(Robot):
         """Whether LeRobot said that what comes belongs to no episode."""
         return isinstance(self._phase, str)
 
+    def _goes_to_places(self, action: dict[str, float]) -> bool:
+        """Whether an action holds targets only, such as LeRobot's return of an arm to its start."""
+        targets = {command.name for command in self._trained_on.commands if command.meaning == "target"}
+        return bool(action) and set(action) <= targets
+
+    def _bounded(self, action: dict[str, float]) -> dict[str, float]:
+        """A move that is not filtered: each of its targets goes no further at once than those of the data."""
+        self._decided_at = -math.inf
+        if self._observation is None:
+            self.get_observation()
+        bounded = dict(action)
+        for command in self._trained_on.commands:
+            name = command.name
+            if command.of_state is not None and name in action:
+                low, high = self._trained_on.motion_ranges[name]
+                start = self._moved.get(name, float(self._observation[command.of_state]))
+                bounded[name] = self._moved[name] = min(max(action[name], start + low), start + high)
+        return bounded
+
     def _carry_out(self, decision: FilterDecision, action: dict[str, float]) -> dict[str, float]:
         """The action of a decision on an action."""
-        if not decision.intervened.item():
+        if not decision.intervened.item() and torch.equal(decision.action, decision.proposed):
             return action
-        if isinstance(self._phase, int) and not self._early:
+        if isinstance(self._phase, int) and self.journal is None:
             self._say_once(
                 "LeRobot stores what was proposed, not what is executed now; `latentsafe record` stores that"
             )
         return dict(zip(self._trained_on.action_names, decision.action[0].tolist()))
 
     def _hold(self, action: dict[str, float]) -> dict[str, float]:
-        """Instead of a command of which the filter knows nothing: no motion, the frozen commands as they are."""
+        """Instead of a command of which the filter knows nothing: stay."""
         self._say_once(
             f"the filter knows nothing of a command of {', '.join(action)}: "
             "the robot holds still. --robot.unfiltered_moves=true lets such moves pass unfiltered"
@@ -240,9 +244,10 @@ class LatentSafeShielded(Robot):
         self._decided_at = -math.inf
         if self._observation is None:
             self.get_observation()
-        now, frozen = {**self._observation, **self._sent}, self.filter.config.fallback.frozen_commands
-        still = dict(zip(self._trained_on.action_names, self.filter.model.units.hold_action(1)[0].tolist()))
-        return {**still, **{name: float(now[name]) for name in frozen if name in now}}
+        names, units = self._trained_on.action_names, self.filter.model.units
+        told = torch.tensor([[float(self._sent.get(name, math.nan)) for name in names]])
+        state = torch.from_numpy(self._frame()[OBS_STATE])[None]
+        return dict(zip(names, units.hold(state.to(units.device), told.to(units.device))[0].tolist()))
 
     # -- what the filter is told ---
 
@@ -301,7 +306,8 @@ class LatentSafeShielded(Robot):
         self.filter.shield.reset()
         self._observation, self._fresh, self._seen_at = None, False, 0.0
         self._phase = None
-        self._sent_early = None
+        self._untaken = None
+        self._moved: dict[str, float] = {}
         self._decided_at = None
         self._gaps: deque[float] = deque(maxlen=RATE_DECISIONS)
         self._cameras: dict[str, dict] = {}

@@ -1,0 +1,248 @@
+"""Robots whose commands are joint targets: whatever is wrong, nothing jumps, and a robot at rest stays at rest."""
+
+import math
+
+import pytest
+import tiny
+import torch
+
+from lerobot_latentsafe.decision import Reason
+from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+from lerobot_latentsafe.shield import UnknownPoseError
+
+PICTURE, STATE = "observation.images.front", "observation.state"
+POSE = torch.tensor([tiny.ARM_POSE])
+LARGEST, USUAL = 6.0, 3.0
+"""Displacements of the data: the largest, and the 99th percentile."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tiny.save_arm_filter(tmp_path_factory.mktemp("arm") / "filter")
+
+
+@pytest.fixture
+def arm(folder):
+    """A filter that passes whatever is not faulty."""
+    policy = LatentSafePolicy.from_pretrained(folder).eval()
+    policy.config.law.epsilon = -2.0
+    return policy
+
+
+def seen(pose=POSE, t=0):
+    picture = torch.rand(len(pose), 3, 32, 32, generator=torch.Generator().manual_seed(t))
+    return {PICTURE: picture, STATE: pose.clone()}
+
+
+def broken(key, value):
+    """A fault of one number of what is seen."""
+
+    def alter(batch):
+        batch[key].view(-1)[0] = value
+        return batch
+
+    return lambda batch, stay: dict(observation=alter(batch), proposed=stay)
+
+
+def far(*degrees):
+    return lambda batch, stay: dict(observation=batch, proposed=stay + torch.tensor([degrees]))
+
+
+def flat(batch, stay):
+    batch[PICTURE][:] = 0.5
+    return dict(observation=batch, proposed=stay)
+
+
+FAULTS = {
+    "a joint that is no number": broken(STATE, math.nan),
+    "a joint that is infinite": broken(STATE, math.inf),
+    "a joint beyond all that was seen": broken(STATE, 1e6),
+    "a joint in another unit": broken(STATE, math.radians(-71) * 100),
+    "a picture that is no number": broken(PICTURE, math.nan),
+    "a picture in bytes": broken(PICTURE, 255.0),
+    "a dead camera": flat,
+    "an old observation": lambda batch, stay: dict(observation=batch, proposed=stay, age_s=1.0),
+    "a base policy that failed": lambda batch, stay: dict(observation=batch, proposed=None),
+    "a proposal that is no number": far(math.nan, 0, 0),
+    "a jump": far(20, 0, 0),
+    "targets of zero degrees": lambda batch, stay: dict(observation=batch, proposed=torch.zeros_like(stay)),
+    "a target beyond the data": far(0, 0, 45),
+    "a loop of another rate": lambda batch, stay: dict(observation=batch, proposed=stay, fault=Reason.WRONG_RATE),
+}
+
+
+def late(arm):
+    """A clock by which every decision takes ten seconds."""
+    arm.config.law.deadline_ms, ticks = 20.0, iter(range(0, 10**6, 10))
+    arm.shield.clock = lambda: float(next(ticks))
+
+
+def sick(arm):
+    """A critic whose values are no numbers."""
+    with torch.no_grad():
+        for parameter in arm.model.critic.parameters():
+            parameter.fill_(math.nan)
+
+
+@pytest.mark.parametrize("fault", [*FAULTS, "late", "sick"])
+def test_a_robot_at_rest_that_is_to_stay_does_not_move_whatever_is_wrong(arm, fault):
+    arm.shield(seen(), POSE)
+    if fault in ("late", "sick"):
+        (late if fault == "late" else sick)(arm)
+    for t in range(8):
+        given = FAULTS[fault](seen(t=t), POSE) if fault in FAULTS else dict(observation=seen(t=t), proposed=POSE)
+        decision = arm.shield(**given)
+        assert decision.reason.item() != Reason.PASSED
+        torch.testing.assert_close(decision.action, POSE)
+
+
+@pytest.mark.parametrize("fault", [*FAULTS, "late", "sick", None])
+@pytest.mark.parametrize("lookahead", [0, 4])
+def test_no_step_is_larger_than_the_usual_ones_of_the_data_even_where_nothing_is_safe(arm, fault, lookahead):
+    arm.config.law.epsilon, arm.config.law.lookahead = 2.0, lookahead
+    if fault in ("late", "sick"):
+        (late if fault == "late" else sick)(arm)
+    pose = POSE.clone()
+    arm.shield(seen(pose), pose)
+    for t in range(8):
+        given = (
+            FAULTS[fault](seen(pose, t), pose) if fault in FAULTS else dict(observation=seen(pose, t), proposed=pose)
+        )
+        action = arm.shield(**given).action
+        assert (action - pose).abs().max() <= USUAL + 1e-4, (t, action, pose)
+        pose = action  # an arm that goes where it is told
+
+
+@pytest.mark.parametrize("law", ["margin", "plan"])
+def test_laws_that_read_no_critic_stay_or_move_within_the_data(arm, law):
+    arm.config.law.epsilon, arm.config.law.name = 2.0, law
+    action = arm.shield(seen(), POSE).action
+    assert (action - POSE).abs().max() <= (USUAL if law == "plan" else 0.0) + 1e-4
+
+
+def test_holding_keeps_a_grip_and_carries_a_sagging_arm(arm):
+    told = POSE + torch.tensor([[1.0, 0.0, -2.5]])  # the arm hangs a degree below, the fingers press on an object
+    arm.shield(seen(), told)
+    torch.testing.assert_close(arm.shield(seen(), None).action, told)
+
+
+def test_an_arm_that_is_moved_away_by_hand_stays_where_it_is(arm):
+    arm.shield(seen(), POSE)
+    for degrees in (4.0, 8.0, 12.0):
+        moved = POSE + torch.tensor([[degrees, 0.0, 0.0]])
+        action = arm.shield(seen(moved), None).action
+    torch.testing.assert_close(action, moved)
+
+
+def test_a_reading_that_leaps_is_believed_only_if_time_has_passed(arm):
+    """From tick to tick the data change by 2 degrees, and three times as much is believed."""
+    leap = lambda degrees: arm.shield(seen(POSE + degrees), POSE + degrees).reason.item()  # noqa: E731
+    assert leap(0.0) == Reason.PASSED
+    assert leap(7.0) == Reason.OBSERVATION_OUT_OF_RANGE
+    assert leap(7.0) == Reason.PASSED  # two ticks from the last reading
+    for _ in range(20):
+        assert leap(40.0) == Reason.OBSERVATION_OUT_OF_RANGE  # however long it says so
+    assert leap(8.0) == Reason.PASSED
+    arm.reset()
+    assert leap(29.0) == Reason.PASSED
+
+
+def test_without_a_usable_state_the_last_goal_stays(arm):
+    told = POSE + torch.tensor([[5.0, 0.0, 0.0]])
+    arm.shield(seen(), told)
+    nothing = torch.full_like(POSE, math.nan)
+    arm.config.law.epsilon = 2.0  # not even the fallback moves from a place that nobody knows
+    for t in range(4):
+        torch.testing.assert_close(arm.shield(seen(nothing, t), POSE).action, told)
+
+
+def test_nothing_is_commanded_to_an_arm_that_nobody_has_seen(arm):
+    with pytest.raises(UnknownPoseError, match="nobody knows where the robot is, so nothing is commanded"):
+        arm.shield(seen(torch.full_like(POSE, math.nan)), POSE)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "reason", "executed"),
+    [
+        ([-70.0, 68.0, 20.0], Reason.PASSED, [-70.0, 68.0, 20.0]),
+        ([-71.0 + 6.5, 68.0, 20.0], Reason.PASSED, [-65.0, 68.0, 20.0]),  # a little too far at once
+        ([-71.0 - 7.0, 68.0, 20.0], Reason.PASSED, [-77.0, 68.0, 20.0]),
+        ([-71.0 + 7.5, 68.0, 20.0], Reason.ACTION_OUT_OF_RANGE, tiny.ARM_POSE),
+        ([109.0, -112.0, 20.0], Reason.ACTION_OUT_OF_RANGE, tiny.ARM_POSE),
+    ],
+)
+def test_an_action_a_little_out_of_range_is_clipped_and_others_are_stopped(arm, wanted, reason, executed, caplog):
+    for _ in range(2):
+        decision = arm.shield(seen(), torch.tensor([wanted]))
+        assert decision.reason.item() == reason
+        torch.testing.assert_close(decision.action, torch.tensor([executed]))
+        torch.testing.assert_close(decision.proposed, torch.tensor([wanted]))
+    clipped = reason == Reason.PASSED and executed != wanted
+    assert sum("what is executed is clipped: lift.pos" in message for message in caplog.messages) == clipped
+
+
+def test_targets_beyond_the_datas_range_are_clipped_to_it(arm):
+    pose = torch.tensor([[-41.5, 68.0, 20.0]])  # the data end at -41
+    decision = arm.shield(seen(pose), pose + torch.tensor([[2.0, 0.0, 0.0]]))
+    assert decision.reason.item() == Reason.PASSED and decision.action[0, 0] == -41.0
+    outside = torch.tensor([[-40.0, 68.0, 20.0]])  # an arm that hangs beyond may stay there
+    torch.testing.assert_close(arm.shield(seen(outside), outside).action, outside)
+
+
+def test_the_world_model_hears_one_degree_and_standing_still_is_zero(arm):
+    units = arm.model.units
+    one = POSE + torch.tensor([[1.0, 0.0, 0.0]])
+    torch.testing.assert_close(units.heard_action(one, POSE), torch.tensor([[1 / USUAL, 0.0, 0.0]]))
+    torch.testing.assert_close(units.denormalise_action(units.normalise_action(one, POSE), POSE), one)
+    torch.testing.assert_close(units.still, torch.zeros(1, 3))
+    assert units.heard_action(POSE + 1000, POSE).max() <= 4.0
+    with pytest.raises(ValueError, match="mean nothing without the state"):
+        units.normalise_action(one)
+    arm.shield(seen(), one)
+    torch.testing.assert_close(arm.shield.executed, units.heard_action(one, POSE))
+
+
+def test_a_retreat_is_a_motion(arm):
+    arm.config.law.epsilon, arm.config.law.retreat = 2.0, {"lift.pos": -2.0}
+    torch.testing.assert_close(arm.shield(seen(), POSE).action, POSE - torch.tensor([[2.0, 0.0, 0.0]]))
+    with pytest.raises(ValueError, match=r"retreat moves lift.pos by -71; the filter was trained on -6 to 6"):
+        arm.config.change(law=tiny.LawConfig(retreat={"lift.pos": -71.0}))
+
+
+def test_a_robot_of_targets_and_velocities_stops_and_stays(tmp_path):
+    names = ["arm_lift.pos", "arm_elbow.pos", "x.vel"]
+    meanings = {"arm_lift.pos": "target", "arm_elbow.pos": "target", "x.vel": "velocity"}
+    low, high = [-101.0, 38.0, -0.3], [-41.0, 98.0, 0.3]
+    trained = tiny.save_arm_filter(
+        tmp_path / "base", names, meanings, trained_on_action_low=low, trained_on_action_high=high,
+        trained_on_state_low=low, trained_on_state_high=high,
+    )  # fmt: skip
+    policy = LatentSafePolicy.from_pretrained(trained).eval()
+    policy.config.law.epsilon = -2.0
+    pose = torch.tensor([[-71.0, 68.0, 0.2]])
+    policy.shield(seen(pose), pose)
+    torch.testing.assert_close(policy.shield(seen(pose), None).action, torch.tensor([[-71.0, 68.0, 0.0]]))
+
+
+def test_a_switch_is_left_as_it_is(tmp_path):
+    names = ["lift.pos", "suction"]
+    trained = tiny.save_arm_filter(
+        tmp_path / "switch", names, {"lift.pos": "target", "suction": "other"}, law_epsilon=2.0,
+        trained_on_action_low=[-101.0, 0.0], trained_on_action_high=[-41.0, 1.0],
+        trained_on_state_low=[-101.0, 0.0], trained_on_state_high=[-41.0, 1.0],
+    )  # fmt: skip
+    policy, pose = LatentSafePolicy.from_pretrained(trained).eval(), torch.tensor([[-71.0, 1.0]])
+    assert policy.shield(seen(pose), torch.tensor([[-71.0, 0.0]])).action[0, 1] == 1.0  # as seen
+    policy.config.law.epsilon = -2.0
+    policy.shield(seen(pose), torch.tensor([[-71.0, 0.0]]))
+    policy.config.law.epsilon = 2.0
+    assert policy.shield(seen(pose), torch.tensor([[-71.0, 1.0]])).action[0, 1] == 0.0  # as told
+
+
+def test_rows_of_a_batch_are_judged_by_themselves(arm):
+    poses = torch.cat([POSE, POSE + 10])
+    arm.shield(seen(poses), poses)
+    wrong = seen(poses, 1)
+    wrong[STATE][0, 0] = math.nan
+    decision = arm.shield(wrong, poses + 1)
+    torch.testing.assert_close(decision.action, torch.cat([POSE, POSE + 11]))
