@@ -5,14 +5,16 @@ from pathlib import Path
 import pytest
 import yaml
 
-from lerobot_latentsafe.collection import franka
+from lerobot_latentsafe.collection import franka, so101
 from lerobot_latentsafe.collection.dubins import FEATURES, POSITION, SOURCES, WITH_POSITION
 from lerobot_latentsafe.franka.scenes import SCENES
 
 FOLDER = Path(__file__).parents[1] / "datasets_cards"
 
 
-CARDS = {f"dubins_{source}": source for source in SOURCES} | {source: source for source in franka.SOURCES}
+CARDS = {f"dubins_{source}": source for source in SOURCES} | {
+    source: source for source in (*franka.SOURCES, *so101.SOURCES)
+}
 """Name of a card -> what `latentsafe collect` calls the source."""
 
 
@@ -20,6 +22,8 @@ def recorded(source):
     """fps, robot type and features of a source's dataset."""
     if source in SOURCES:
         return 20, "latentsafe_dubins", {**FEATURES, **(POSITION if source in WITH_POSITION else {})}
+    if source in so101.SOURCES:
+        return so101.FPS, so101.LatentSafeSO101Mujoco.name, so101.FEATURES
     of_franka = franka.SOURCES[source]
     return SCENES[of_franka.scene].fps, "latentsafe_franka_mujoco", franka.features(of_franka)
 

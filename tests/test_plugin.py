@@ -105,11 +105,11 @@ def test_wheel_holds_nothing_else(installed):
 def test_lerobot_discovers_policy_env_and_world_model(discovered, installed):
     assert all(Path(file).is_relative_to(installed) for file in discovered["files"])  # not this repository's
     assert "latentsafe" in discovered["policies"]
-    assert {"latentsafe_dubins", "latentsafe_bag", "latentsafe_blocks"} <= set(discovered["envs"])
-    assert {"latentsafe_franka", "latentsafe_franka_mujoco", "latentsafe_shielded"} <= set(discovered["robots"])
-    assert {"latentsafe_scripted", "latentsafe_end_effector"} <= set(discovered["teleoperators"])
+    assert {"latentsafe_dubins", "latentsafe_bag", "latentsafe_blocks", "latentsafe_so101"} <= set(discovered["envs"])
+    assert {"latentsafe_franka_mujoco", "latentsafe_so101_mujoco", "latentsafe_shielded"} <= set(discovered["robots"])
+    assert {"latentsafe_scripted", "latentsafe_end_effector", "latentsafe_so101_leader"} <= set(discovered["teleoperators"])
     assert "rssm" in discovered["world_models"]
-    assert discovered["gym"] == [f"lerobot_latentsafe/{name}-v0" for name in ("Dubins", "Bag", "Blocks")]
+    assert discovered["gym"] == [f"lerobot_latentsafe/{name}-v0" for name in ("Dubins", "Bag", "Blocks", "SO101")]
 
 
 def test_importing_the_package_loads_nothing_heavy(discovered):

@@ -1,7 +1,7 @@
 """The SO-101 that pushes a cube as a gymnasium environment, for `lerobot-eval`."""
 
 from lerobot_latentsafe.envs.scene_env import SceneEnv
-from lerobot_latentsafe.so101.actions import CAMERAS, HIGH, IMAGE_SIZE, LOW, NAMES
+from lerobot_latentsafe.so101.actions import CAMERAS, EPISODE_SECONDS, FPS, HIGH, IMAGE_SIZE, LOW, NAMES
 from lerobot_latentsafe.so101.scene import PushScene
 
 
@@ -10,5 +10,10 @@ class SO101Env(SceneEnv):
 
     cameras, state_names, action_names = CAMERAS, NAMES, NAMES
 
-    def __init__(self, episode_length: int = 150, image_size: int = IMAGE_SIZE, render_mode: str = "rgb_array"):
+    def __init__(
+        self,
+        episode_length: int = round(EPISODE_SECONDS * FPS),
+        image_size: int = IMAGE_SIZE,
+        render_mode: str = "rgb_array",
+    ):
         super().__init__(PushScene(image_size), episode_length, (LOW, HIGH), render_mode)

@@ -7,7 +7,7 @@ from lerobot_latentsafe.robots.uncalibrated import Uncalibrated
 
 
 class FrankaDevice(Uncalibrated):
-    """Speaks the Franka's actions. Name it before LeRobot's base class. Home a real gripper in Desk after changing fingers."""
+    """Speaks the Franka's actions. Home a real gripper in Desk after changing fingers."""
 
     @cached_property
     def action_features(self) -> dict:

@@ -14,9 +14,9 @@ logger = logging.getLogger(__name__)
 
 FPS = 30
 CAMERAS = ("front", "wrist")
-IMAGE_SIZE = 96
+IMAGE_SIZE = 64
 """Side of both cameras' pictures, pixels."""
-EPISODE_SECONDS = 5.0
+EPISODE_SECONDS = 4.0
 JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 NAMES = [f"{joint}.pos" for joint in JOINTS]
 LOW = np.array([-110.0, -100.0, -97.0, -95.0, -157.0, 0.0])

@@ -19,6 +19,7 @@ from lerobot_latentsafe.so101.actions import (
     IMAGE_SIZE,
     JOINTS,
     LOW,
+    NAMES,
     REST,
     SHOULDER,
     UPPER_ARM,
@@ -36,6 +37,8 @@ STARTS, AZIMUTHS = (0.205, 0.220), (-12.0, 12.0)
 """Between these the cube starts: m ahead of the arm, and degrees to its left."""
 ON_MARK = 0.015
 """Distance of the cube's centre from the mark's up to which it is on it, m."""
+STATE = ["cube_x", "cube_y", "cube_z", "mark_x", "tip_x", "tip_y", "tip_z", *NAMES]
+"""What `truth()["state"]` holds: places in m, then the measured joints."""
 OPENING = np.radians([-5.0, 90.0])
 """Of the jaw at 0 and at 100, radians."""
 
@@ -102,7 +105,7 @@ class PushScene:
         return self.data.site_xpos[self.tip].copy()
 
     def truth(self) -> dict[str, float | bool | np.ndarray]:
-        """Privileged: `margin` (m to the edge), `failure`, `is_success`, `severity` (share of the cube past the edge)."""
+        """Privileged. `margin`: m to the edge; `severity`: share of the cube past it; `state`: see `STATE`."""
         cube = self.cube_position()
         failure = bool(cube[0] > EDGE or cube[2] < 0)
         on_mark = bool(abs(cube[0] - self.mark) < ON_MARK and not failure)
@@ -112,7 +115,7 @@ class PushScene:
             "is_success": on_mark,
             "reward": float(on_mark),
             "severity": float(np.clip((cube[0] + HALF_CUBE - EDGE) / (2 * HALF_CUBE), 0, 1)),
-            "state": np.array([*cube, self.mark, *self.tip_position()], np.float32),
+            "state": np.array([*cube, self.mark, *self.tip_position(), *self.proprioception()], np.float32),
         }
 
     def render(self, camera: str) -> np.ndarray:

@@ -1,0 +1,51 @@
+#!/usr/bin/env bash
+# The SO-101: its data, two ACT policies, three filters and the comparison, from nothing, resumable: a step whose output
+# exists is skipped.
+#   scripts/reproduce_so101.sh [OUT]     OUT defaults to outputs/so101; recordings go to data, or to $DATA
+set -euo pipefail
+cd "$(dirname "$0")/.."
+OUT=${1:-outputs/so101} DATA=${DATA:-data} SEEDS=${SEEDS:-0 1 2}
+BIN=.venv/bin
+export HF_HUB_OFFLINE=1 OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
+mkdir -p "$OUT"
+[ -e "$OUT/cost.csv" ] || echo "step,user_s,system_s" >"$OUT/cost.csv"
+
+timed() { # name command... : user and system CPU seconds of the command go to $OUT/cost.csv
+  local name=$1; shift
+  TIMEFORMAT="$name,%U,%S"
+  { time "$@" 2>&3; } 3>&2 2>>"$OUT/cost.csv"
+}
+
+record() { # name source seed
+  [ -e "$DATA/$1" ] || timed "record_$1" $BIN/latentsafe collect --source="$2" --dataset.repo_id="latentsafe/$1" \
+    --dataset.root="$DATA/$1" --seed="$3"
+}
+
+act() { # what it learns from
+  [ -e "$OUT/act_$1/checkpoints/last" ] || timed "act_$1" $BIN/lerobot-train --config_path=configs/so101_act.yaml \
+    --dataset.repo_id="latentsafe/so101_$1" --dataset.root="$DATA/so101_$1" --output_dir="$OUT/act_$1"
+}
+
+filter() { # seed
+  local wm="$OUT/wm_$1" data="--dataset.repo_id=latentsafe/so101_mix_cache --dataset.root=$DATA/so101_cache"
+  [ -e "$wm/checkpoints/last" ] || timed "world_model_$1" $BIN/lerobot-train --config_path=configs/so101_rssm.yaml $data \
+    --policy.frame_cache="$DATA/so101_cache" --output_dir="$wm" --seed="$1"
+  [ -e "$OUT/filter_$1" ] || timed "reachability_$1" $BIN/latentsafe train-reachability \
+    --policy.path="$wm/checkpoints/last/pretrained_model" $data --output_dir="$OUT/filter_$1" --seeds="[$1]"
+}
+
+record so101_reckless so101_reckless 1
+record so101_careful so101_careful 2
+record so101_mix so101_mix 0
+act reckless
+act careful
+[ -e "$DATA/so101_cache" ] || timed cache $BIN/latentsafe cache --dataset.repo_id=latentsafe/so101_mix \
+  --dataset.root="$DATA/so101_mix" --output_dir="$DATA/so101_cache"
+for seed in $SEEDS; do
+  filter "$seed"
+done
+
+policies="$OUT/act_reckless/checkpoints/last/pretrained_model $OUT/act_careful/checkpoints/last/pretrained_model"
+$BIN/python scripts/so101_ranges.py --policies $policies --datasets "$DATA/so101_reckless" "$DATA/so101_careful"
+filters=$(for seed in $SEEDS; do echo "$OUT/filter_$seed"; done)
+$BIN/python scripts/so101_policies.py --reckless=${policies% *} --careful=${policies#* } --filters $filters
