@@ -15,6 +15,7 @@ from lerobot_latentsafe.policies.grasp_prediction import GraspPredictionStep
 from lerobot_latentsafe.robots.franka.config_franka import LatentSafeFrankaConfig
 from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
 from lerobot_latentsafe.robots.shielded.config_shielded import LatentSafeShieldedConfig
+from lerobot_latentsafe.runtime.policy_server import serve_types
 from lerobot_latentsafe.teleoperators.end_effector.config_end_effector import LatentSafeEndEffectorConfig
 from lerobot_latentsafe.teleoperators.scripted.config_scripted import LatentSafeScriptedConfig
 
@@ -55,6 +56,8 @@ __all__ = [
     "values_along",
 ]
 __version__ = "0.2.0"
+
+serve_types(["latentsafe", "latentsafe_dreamer"])
 
 
 def __getattr__(name: str) -> Any:

@@ -117,26 +117,17 @@ def plan_chunk(policy: "PreTrainedPolicy", batch: dict) -> Tensor:
     return chunk.transpose(0, 1) if config.type == "tdmpc" else chunk  # tdmpc: (N, B, A)
 
 
-def load_adapted(
-    policy_class: type["PreTrainedPolicy"], folder: Path, config: "PreTrainedConfig"
-) -> "PreTrainedPolicy":
-    """The policy that a PEFT adapter was trained on, with the adapter merged into its weights.
+def merged_adapter(policy: "PreTrainedPolicy", folder: Path) -> "PreTrainedPolicy":
+    """A policy with a PEFT adapter of it merged into its weights: a policy like any other.
 
     Raises:
         ImportError: peft is not installed.
-        ValueError: the adapter does not say what it was trained on, or cannot be merged.
+        ValueError: an adapter that is not a change of weights.
     """
     require_package("peft", extra="peft")
-    from peft import PeftConfig, PeftModel
+    from peft import PeftModel
 
-    adapter = PeftConfig.from_pretrained(str(folder))
-    if not adapter.base_model_name_or_path:
-        raise ValueError(
-            f"{folder / ADAPTER} names no base_model_name_or_path: the policy it was trained on is unknown"
-        )
-    config.use_peft = False  # merged, it is a policy like any other
-    policy = policy_class.from_pretrained(adapter.base_model_name_or_path, config=config, revision=adapter.revision)
-    adapted = PeftModel.from_pretrained(policy, str(folder), config=adapter)
+    adapted = PeftModel.from_pretrained(policy, str(folder))
     if not hasattr(adapted, "merge_and_unload"):
-        raise ValueError(f"an adapter of type {adapter.peft_type} cannot be merged into weights; use a LoRA adapter")
+        raise ValueError(f"the adapter {folder} cannot be merged into weights; shield a policy with a LoRA adapter")
     return adapted.merge_and_unload().eval()

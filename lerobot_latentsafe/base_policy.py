@@ -1,5 +1,6 @@
 """The policy to be shielded: any LeRobot policy with its own processors."""
 
+import json
 import logging
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,13 +10,13 @@ from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.processor import PolicyProcessorPipeline, RelativeActionsProcessorStep
 from lerobot.utils.constants import OBS_STATE
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from lerobot_latentsafe._compat import ADAPTER, forget_plan, is_lerobots, load_adapted
+from lerobot_latentsafe._compat import ADAPTER, forget_plan, is_lerobots, merged_adapter
 from lerobot_latentsafe.action_chunks import ChunksAhead
 from lerobot_latentsafe.origin import Origin, inverse, order
-from lerobot_latentsafe.runtime.checkpoint import CheckpointError, read_config, resolve_checkpoint
+from lerobot_latentsafe.runtime.checkpoint import WEIGHTS, CheckpointError, read_config, resolve_checkpoint
 
 logger = logging.getLogger(__name__)
 
@@ -130,12 +131,25 @@ def _load_policy(folder: Path, config: PreTrainedConfig) -> PreTrainedPolicy:
     kind = get_policy_class(config.type)
     try:
         if (folder / ADAPTER).exists():
-            return load_adapted(kind, folder, config)
+            return _load_adapted(kind, folder, config)
+        with safe_open(folder / WEIGHTS, "pt"):  # some policies of LeRobot go on with random weights
+            pass
         return kind.from_pretrained(folder, config=config, strict=True)
-    except (SafetensorError, RuntimeError) as e:
+    except (SafetensorError, RuntimeError, FileNotFoundError) as e:
         raise CheckpointError(f"base policy {folder}: weights unreadable or not its own ({e}); copy it again") from e
     except ImportError as e:
         raise CheckpointError(f"base policy {folder} ({config.type}) needs a package that is not here: {e}") from e
+
+
+def _load_adapted(kind: type[PreTrainedPolicy], folder: Path, config: PreTrainedConfig) -> PreTrainedPolicy:
+    """The policy that a PEFT adapter was trained on, with the adapter merged into it."""
+    adapter = json.loads((folder / ADAPTER).read_text())
+    adapted = adapter.get("base_model_name_or_path")
+    if not adapted:
+        raise CheckpointError(f"{folder / ADAPTER} names no base_model_name_or_path: write there what was adapted")
+    config.use_peft = False
+    policy = kind.from_pretrained(resolve_checkpoint(adapted, adapter.get("revision")), config=config, strict=True)
+    return merged_adapter(policy, folder)
 
 
 def _refuse_filter(config: PreTrainedConfig, path: str | Path) -> None:
