@@ -51,6 +51,7 @@ class LatentSafeShielded(Robot):
 
     _phase: int | str | None
     _decided_at: float | None
+    _untaken: dict[str, float] | None
 
     def __init__(self, config: LatentSafeShieldedConfig):
         super().__init__(config)
@@ -285,7 +286,7 @@ class LatentSafeShielded(Robot):
         self.filter.shield.reset()
         self._observation, self._fresh, self._seen_at = None, False, 0.0
         self._phase = None
-        self._untaken: dict[str, float] | None = None
+        self._untaken = None
         self._decided_at = None
         self._gaps: deque[float] = deque(maxlen=RATE_DECISIONS)
         self._cameras: dict[str, dict] = {}
