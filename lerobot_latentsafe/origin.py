@@ -29,20 +29,20 @@ class Origin:
     def of(cls, config: PreTrainedConfig, folder: Path | None = None) -> "Origin":
         """What is known of a policy: by `FILE`, by its configuration, by the dataset that it was trained on.
 
+        Args:
+            folder: the policy's; by default where it was loaded from, if that is on this machine.
+
         Raises:
             ValueError: `FILE` is not readable.
         """
-        told = [_told(folder / FILE)] if folder else []
-        told.append(
-            {
-                "action_names": getattr(config, "action_names", None) or getattr(config, "action_feature_names", None),
-                "state_names": getattr(config, "state_names", None),
-                "fps": getattr(config, "fps", None),
-            }
-        )
-        if folder:
-            told.append(_of_dataset(folder))
-        return cls(**{name: next((t[name] for t in told if t.get(name)), None) for name in asdict(cls())})
+        folder = folder or getattr(config, "pretrained_path", None)
+        own = {
+            "action_names": getattr(config, "action_names", None) or getattr(config, "action_feature_names", None),
+            "state_names": getattr(config, "state_names", None),
+            "fps": getattr(config, "fps", None),
+        }
+        told = [_told(Path(folder) / FILE), own, _of_dataset(Path(folder))] if folder else [own]
+        return cls(**{name: next((t[name] for t in told if t.get(name)), None) for name in own})
 
     def save(self, folder: Path) -> None:
         """Write what is known to a policy's folder, if anything is."""

@@ -36,7 +36,8 @@ LEROBOT = {
 }
 """LeRobot's commands and the option class of each."""
 OTHERS = {"cpu", "num_processes", "nproc_per_node", "nnodes", "rdzv_backend", "rdzv_endpoint", "local_addr", "flavor"}
-"""Options of accelerate, torchrun and hf that pages name alone."""
+OTHERS |= {"policy_type", "actions_per_chunk"}
+"""Options of accelerate, torchrun, hf and LeRobot's robot client that pages name alone."""
 PLACES = {path.name for path in ROOT.iterdir() if path.is_dir() and not path.name.startswith(".")} - {"outputs", "data"}
 NAMED_FILES = (".py", ".sh", ".md", ".yaml", ".yml", ".toml", ".cff", ".lock", ".svg")
 INVENTED = {"my_module.py"}
