@@ -89,7 +89,12 @@ def test_check_dataset_tells_what_to_know(capsys, tmp_path):
     world.edit_feature(world.delete(root, "meta/stats.json"), "action", names=["all"])
     code, said = says(capsys, "check-dataset", f"--dataset.root={root}")
     assert code == 1 and "trained_on.meanings='{action_0: delta, action_1: delta}'" in said.strip().splitlines()[-1]
-    for words in ("action_0, action_1 here", "of unknown meaning", "without proprioception", "use_imagenet_stats=false"):
+    for words in (
+        "action_0, action_1 here",
+        "of unknown meaning",
+        "without proprioception",
+        "use_imagenet_stats=false",
+    ):
         assert words in said
 
 

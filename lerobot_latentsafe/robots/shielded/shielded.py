@@ -161,7 +161,15 @@ class LatentSafeShielded(Robot):
 
         Returns:
             What was executed.
+
+        Raises:
+            ValueError: while it records, a command that is not the robot's; nothing was sent.
         """
+        if self.journal and not self._between and set(action) != set(self.action_features):
+            raise ValueError(
+                f"the operator commands {', '.join(action)}; {self.name} takes {', '.join(self.action_features)}. "
+                "Nothing was sent; use a teleoperator of this robot"
+            )
         shield, names = self.filter.shield, self._trained_on.action_names
         before = shield.decision
         sent = self.inner.send_action(self._decide(action))
