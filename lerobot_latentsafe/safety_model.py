@@ -8,6 +8,7 @@ from contextlib import AbstractContextManager
 from typing import Any
 
 import torch
+from lerobot.utils.constants import OBS_STATE
 from torch import Tensor, nn
 
 from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
@@ -145,11 +146,21 @@ class SafetyModel(nn.Module):
         """Numbers on this model's device; of 64-bit floats, which Apple's GPUs do not have, single ones."""
         return numbers.to(self.device, torch.float32) if numbers.is_floating_point() else numbers.to(self.device)
 
+    @property
+    def inputs(self) -> list[str]:
+        """Keys of an observation that are read."""
+        return [*self.world_model.image_keys, *([OBS_STATE] if self.units.state_names else [])]
+
+    def state(self, observation: dict[str, Tensor]) -> Tensor:
+        """Proprioception (B, S) in robot units; S is 0 where the model was trained without."""
+        if not self.units.state_names:
+            return torch.zeros(len(observation[self.world_model.image_keys[0]]), 0, device=self.device)
+        return self.place(observation[OBS_STATE]).float()
+
     def see(self, observation: dict[str, Tensor]) -> tuple[dict[str, Tensor], Tensor]:
         """Percepts and normalised proprioception (B, S) of a LeRobot batch of observations in robot units."""
         images = {key: self.images(self.place(observation[key])) for key in self.world_model.image_keys}
-        state = self.units.normalise_state(self.place(observation["observation.state"]))
-        return self.world_model.perceive(images), state
+        return self.world_model.perceive(images), self.units.normalise_state(self.state(observation))
 
     # -- deciding ---
 

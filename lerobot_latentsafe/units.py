@@ -121,6 +121,7 @@ class Units(nn.Module):
     frozen: Tensor
     stays: Tensor
     is_target: Tensor
+    _shown_by: Tensor
 
     def __init__(self, trained_on: TrainedOn, frozen_commands: list[str]):
         super().__init__()

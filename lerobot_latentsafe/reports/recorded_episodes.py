@@ -48,7 +48,8 @@ class RecordedEpisodes:
         stored = read_frames(frames.root, ["frame_index", "action", "observation.state"])
         meant = np.isin(stored["episode_index"], frames.episodes)
         stored = {name: column[meant] for name, column in stored.items()}
-        self.episode, self.executed, self.state = (stored[k] for k in ("episode_index", "action", "observation.state"))
+        self.episode, self.executed = stored["episode_index"], stored["action"]
+        self.state = stored.get("observation.state", np.zeros((len(self.episode), 0)))
         self.decisions = decision_columns(frames.root / FILE, stored)
 
     @staticmethod

@@ -296,7 +296,7 @@ class LatentSafeShielded(Robot):
             last = self._cameras.get(key)
             if last is None or not np.array_equal(last["picture"], picture):
                 self._cameras[key] = {"picture": picture, "at": now, "state": state, "repeats": 0}
-            elif (state - last["state"]).abs().max() > MOVED:
+            elif ((state - last["state"]).abs() > MOVED).any():
                 last["repeats"] += 1
 
     def _age(self, now: float) -> float:
