@@ -13,6 +13,7 @@ from lerobot_latentsafe.datasets.labels import FAILING, SAFE, UNLABELLED, all_la
 from lerobot_latentsafe.datasets.layout import INFO, NO_STATISTICS, STATISTICS, lacks_statistics
 from lerobot_latentsafe.datasets.names import usable_names
 from lerobot_latentsafe.datasets.reading import reading
+from lerobot_latentsafe.meanings import Command, tell_meanings
 
 ON_TIME = 1e-4
 """Seconds by which LeRobot lets a picture's time differ from a frame's, if it is not told otherwise."""
@@ -34,14 +35,17 @@ def rows(contract: Contract) -> list[Row]:
     ]
     table += [("camera", f"{key}: {c} channels, {h} x {w} pixels") for key, (c, h, w) in contract.cameras.items()]
     table += [("left out", f"{key}: {why}") for key, why in contract.left_out.items()]
-    for what, names, numbers in (
-        ("state", contract.state_names, contract.state),
-        ("command", contract.action_names, contract.action),
-    ):
-        table += [
-            (what, f"{name}: {low:g} to {high:g}") for name, low, high in zip(names, numbers.min(0), numbers.max(0))
-        ]
-    return table
+    table += [("state", line) for line in _ranges(contract.state_names, contract.state)]
+    commands = zip(_ranges(contract.action_names, contract.action), _commands(contract))
+    return table + [("command", f"{line}, {command.meaning or 'of unknown meaning'}") for line, command in commands]
+
+
+def _commands(contract: Contract) -> list[Command]:
+    return tell_meanings(contract.state_names, contract.action_names, contract.state, contract.action, contract.episode)
+
+
+def _ranges(names: list[str], numbers: np.ndarray) -> list[str]:
+    return [f"{name}: {low:g} to {high:g}" for name, low, high in zip(names, numbers.min(0), numbers.max(0))]
 
 
 def feature_rows(meta: LeRobotDatasetMetadata) -> list[Row]:
@@ -103,6 +107,12 @@ def advice(meta: LeRobotDatasetMetadata, contract: Contract) -> Iterator[str]:
                 f"{key} has {len(names)} numbers and the names {given}; they are called {', '.join(names)} here. Write "
                 f"one name a number into {INFO} if a robot has others"
             )
+    doubtful = [command.name for command in _commands(contract) if command.meaning is None]
+    if doubtful:
+        yield (
+            f"nothing tells what {', '.join(doubtful)} means: say it when you train, with --policy.trained_on.meanings="
+            f"'{{{', '.join(f'{name}: delta' for name in doubtful)}}}' (or target, velocity, other)"
+        )
     if not contract.state_names:
         yield f"there is no {STATE}: a filter sees pictures alone, without proprioception"
     if lacks_statistics(meta.root, meta.camera_keys):
