@@ -69,7 +69,7 @@ class SafetyModel(nn.Module):
     Attributes:
         units: normalises and denormalises.
         world_model, margin, critic: the parts.
-        has_fresh_weights: whether nothing was loaded or trained yet, whatever the configuration says of its weights.
+        lacks_weights: whether the configuration speaks of trained weights, and nothing was loaded or trained since.
 
     Raises:
         UntrainedFilterError: nothing says what actions and states look like.
@@ -90,7 +90,7 @@ class SafetyModel(nn.Module):
         config.change(world_model=self.world_model.config)
         self.margin = self.new_margin()
         self.critic = self.new_critic()
-        self.has_fresh_weights = True
+        self.lacks_weights = trained_on.has_reached("world_model")
         self.register_load_state_dict_post_hook(_has_loaded)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "SafetyModel":
@@ -216,7 +216,7 @@ class SafetyModel(nn.Module):
                 f"this filter's stage is {trained_on.stage!r}, {stage!r} is needed: its {part} was never "
                 f"trained. Run {command} first"
             )
-        if self.has_fresh_weights:
+        if self.lacks_weights:
             raise UntrainedFilterError(
                 "this filter has random weights: its configuration was read, its weights were not. Load both with "
                 "LatentSafePolicy.from_pretrained(folder), or set config.pretrained_path to the folder before "
@@ -236,9 +236,9 @@ class SafetyModel(nn.Module):
         correct = (((margin < 0) == (failure == 1)) & labelled).sum() / labelled.sum()
         if self.training:  # a critic of the world model before knows nothing of this one
             self.config.trained_on.stage = "world_model"
-            self.has_fresh_weights = False
+            self.lacks_weights = False
         return loss, features, {**metrics, "loss_margin": margin_loss, "margin_accuracy": correct}
 
 
 def _has_loaded(model: SafetyModel, incompatible: Any) -> None:
-    model.has_fresh_weights = False
+    model.lacks_weights = False
