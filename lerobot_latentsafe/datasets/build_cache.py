@@ -65,7 +65,11 @@ class Sight:
     def pieces(self, place: int, numbers: Sequence[int] | None = None) -> Iterator[dict[str, Tensor]]:
         """Of all its frames, or of some, in order: camera key -> (n, 3, S, S) in [0, 1]."""
         for piece in self.frames.pieces(self.frames.cameras, self.frames.episodes[place], numbers):
-            yield {key: to_model_images(images, self.image_size) for key, images in piece.items()}
+            yield {key: self._small(images) for key, images in piece.items()}
+
+    def _small(self, images: Tensor) -> Tensor:
+        """One by one: a large picture in floats is a hundred times as large as what becomes of it."""
+        return torch.cat([to_model_images(image[None], self.image_size) for image in images])
 
 
 class Recipe(Protocol):
