@@ -3,6 +3,7 @@
 import multiprocessing
 import resource
 import sys
+import tempfile
 import time
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -51,7 +52,8 @@ def look_through(root: Path) -> None:
 
 def cache(root: Path) -> None:
     """Build a cache of pictures."""
-    build_frame_cache(LeRobotDataset(REPO_ID, root=root), root.with_name(f"{root.name}_cache"), 128)
+    with tempfile.TemporaryDirectory() as folder:
+        build_frame_cache(LeRobotDataset(REPO_ID, root=root), Path(folder) / "cache", 128)
 
 
 USES = {"page": look_through, "cache": cache}
