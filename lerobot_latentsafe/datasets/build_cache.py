@@ -158,7 +158,7 @@ class Tokens:
         tokens = []
         for episode in episodes:
             picked = rng.permutation(see.length(episode))[: -(-SAMPLED_FRAMES // len(episodes))]
-            tokens += [self._tokens(images) for images in see.pieces(episode, np.sort(picked))]
+            tokens += [self._tokens(images) for images in see.pieces(episode, np.sort(picked).tolist())]
         torch.manual_seed(0)
         self.perception.basis.fit(torch.cat(tokens))
         save_file(self.perception.basis.state_dict(), folder / BASIS)
@@ -249,7 +249,7 @@ def _fill(copy: LeRobotDatasetMetadata, kept: Recipe, see: Sight) -> bool:
     return bool(done.all())
 
 
-def _array(folder: Path, name: str) -> np.ndarray:
+def _array(folder: Path, name: str) -> np.memmap:
     """An array to write into; what was written leaves this process's memory with it."""
     return np.load(folder / f"{name}.npy", mmap_mode="r+")
 

@@ -39,7 +39,9 @@ class _Reader:
         self.container, self.stream = container, container.streams.video[0]
         self.group = np.inf  # seconds between frames that can be decoded alone, as far as seen
         self.key: float | None = None
-        self.before = self.after = self.frames = None
+        self.before: av.VideoFrame | None = None
+        self.after: av.VideoFrame | None = None
+        self.frames: Iterator[av.VideoFrame] | None = None
 
     def nearest(self, time: float) -> av.VideoFrame | None:
         """Of the frames at and around a time; None after the end."""
