@@ -66,7 +66,11 @@ class Sight:
     def pieces(self, place: int, numbers: Sequence[int] | None = None) -> Iterator[dict[str, Tensor]]:
         """Of all its frames, or of some, in order: camera key -> (n, 3, S, S) in [0, 1]."""
         for piece in self.frames.pieces(self.frames.cameras, self.frames.episodes[place], numbers):
-            yield {key: to_model_images(images, self.image_size) for key, images in piece.items()}
+            yield {key: self._small(images) for key, images in piece.items()}
+
+    def _small(self, images: Tensor) -> Tensor:
+        """One by one: a large picture in floats is a hundred times as large as what becomes of it."""
+        return torch.cat([to_model_images(image[None], self.image_size) for image in images])
 
 
 class Recipe(Protocol):
@@ -155,7 +159,7 @@ class Tokens:
         tokens = []
         for episode in episodes:
             picked = rng.permutation(see.length(episode))[: -(-SAMPLED_FRAMES // len(episodes))]
-            tokens += [self._tokens(images) for images in see.pieces(episode, np.sort(picked))]
+            tokens += [self._tokens(images) for images in see.pieces(episode, np.sort(picked).tolist())]
         torch.manual_seed(0)
         self.perception.basis.fit(torch.cat(tokens))
         save_file(self.perception.basis.state_dict(), folder / BASIS)
@@ -255,7 +259,7 @@ def _fill(copy: LeRobotDatasetMetadata, kept: Recipe, see: Sight) -> bool:
     return bool(done.all())
 
 
-def _array(folder: Path, name: str) -> np.ndarray:
+def _array(folder: Path, name: str) -> np.memmap:
     """An array to write into; what was written leaves this process's memory with it."""
     return np.load(folder / f"{name}.npy", mmap_mode="r+")
 
