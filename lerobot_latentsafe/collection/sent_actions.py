@@ -12,6 +12,8 @@ import numpy as np
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import ACTION
 
+from lerobot_latentsafe._compat import last_added
+
 
 @contextmanager
 def storing_what_was_sent(take_sent: Callable[[], dict[str, float] | None]) -> Iterator[None]:
@@ -32,7 +34,7 @@ def storing_what_was_sent(take_sent: Callable[[], dict[str, float] | None]) -> I
             _refuse(", ".join(names), ", ".join(sent) if sent else "nothing")
         action = np.array([sent[name] for name in names], np.float32)
         add(dataset, {**frame, ACTION: action})
-        stored = dataset.writer.episode_buffer[ACTION][-1]
+        stored = last_added(dataset, ACTION)
         if not np.array_equal(stored, action):
             _refuse(str(stored), str(action))
 
