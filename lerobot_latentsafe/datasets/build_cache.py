@@ -48,6 +48,8 @@ from lerobot_latentsafe.runtime.malloc import keep_freed_memory
 LAYOUT, DONE = "layout.json", "done.npy"
 ENCODED_AT_ONCE = 8
 """Frames an encoder reads together: few enough for its activations to stay in a CPU's cache."""
+TOGETHER = 2**21
+"""Numbers of pictures that are made small together."""
 SAMPLED_EPISODES, SAMPLED_FRAMES = 100, 4000
 """From which principal components are found."""
 
@@ -69,8 +71,9 @@ class Sight:
             yield {key: self._small(images) for key, images in piece.items()}
 
     def _small(self, images: Tensor) -> Tensor:
-        """One by one: a large picture in floats is a hundred times as large as what becomes of it."""
-        return torch.cat([to_model_images(image[None], self.image_size) for image in images])
+        """Large ones one by one: in floats, a picture is a hundred times as large as what becomes of it."""
+        parts = images.split(max(1, TOGETHER // images[0].numel()))
+        return torch.cat([to_model_images(part, self.image_size) for part in parts])
 
 
 class Recipe(Protocol):
