@@ -157,6 +157,14 @@ def test_without_a_usable_state_the_last_goal_stays(arm):
         torch.testing.assert_close(arm.shield(seen(nothing, t), POSE).action, told)
 
 
+def test_a_monitor_lets_all_pass_whatever_it_sees(arm):
+    arm.config.law.mode = "monitor"
+    for wanted in (POSE + 50, torch.full_like(POSE, math.nan), torch.zeros_like(POSE)):
+        decision = arm.shield(seen(torch.full_like(POSE, math.nan)), wanted)
+        torch.testing.assert_close(decision.action, wanted, equal_nan=True)
+        assert decision.unsafe.all() and not decision.intervened.any()
+
+
 def test_nothing_is_commanded_to_an_arm_that_nobody_has_seen(arm):
     with pytest.raises(UnknownPoseError, match="nobody knows where the robot is, so nothing is commanded"):
         arm.shield(seen(torch.full_like(POSE, math.nan)), POSE)
