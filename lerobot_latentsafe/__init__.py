@@ -17,6 +17,7 @@ from lerobot_latentsafe.envs.configuration_envs import (
 )
 from lerobot_latentsafe.policies.dreamer.configuration_dreamer import LatentSafeDreamerConfig
 from lerobot_latentsafe.policies.grasp_prediction import GraspPredictionStep
+from lerobot_latentsafe.processor_latentsafe import NoProprioceptionStep
 from lerobot_latentsafe.robots.franka.config_franka import LatentSafeFrankaConfig
 from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
 from lerobot_latentsafe.robots.shielded.config_shielded import LatentSafeShieldedConfig
@@ -58,6 +59,7 @@ __all__ = [
     "LatentSafeScriptedConfig",
     "LatentSafeShieldedConfig",
     "LawOptions",
+    "NoProprioceptionStep",
     "decide",
     "evaluate_filter",
     "load_filter",

@@ -7,6 +7,7 @@ from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pyarrow.parquet as pq
 from lerobot.utils.constants import ACTION
 from lerobot.utils.import_utils import require_package
@@ -15,6 +16,7 @@ from torch import Tensor
 if TYPE_CHECKING:
     from lerobot.configs.policies import PreTrainedConfig
     from lerobot.configs.train import TrainPipelineConfig
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
     from lerobot.policies.pretrained import PreTrainedPolicy
 
 RECORDING = re.compile(r"Recording episode (\d+)$")
@@ -56,6 +58,11 @@ def drop_episode_statistics(root: Path, features: list[str]) -> None:
         table = pq.read_table(file)
         left_over = tuple(f"stats/{feature}/" for feature in features)
         pq.write_table(table.drop_columns([c for c in table.column_names if c.startswith(left_over)]), file)
+
+
+def last_added(dataset: "LeRobotDataset", feature: str) -> np.ndarray:
+    """What a dataset that is being recorded holds of the frame that was added last."""
+    return dataset.writer.episode_buffer[feature][-1]
 
 
 def is_lerobots(policy: "PreTrainedPolicy") -> bool:

@@ -161,7 +161,7 @@ class LatentSafePolicy(PreTrainedPolicy):
                 "the success rate says nothing. Leave out --env.type, or give --env_eval_freq=0; train the critic with "
                 "latentsafe train-reachability, then measure with latentsafe eval-shield"
             )
-        return self.model.units.hold_action(len(batch[OBS_STATE]))
+        return self.model.units.hold(self.model.state(batch))
 
     @torch.no_grad()
     def decide(self, batch: dict[str, Tensor], age_s: float = 0.0) -> FilterDecision:

@@ -8,6 +8,7 @@ from contextlib import AbstractContextManager
 from typing import Any
 
 import torch
+from lerobot.utils.constants import OBS_STATE
 from torch import Tensor, nn
 
 from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
@@ -68,7 +69,7 @@ class SafetyModel(nn.Module):
     Attributes:
         units: normalises and denormalises.
         world_model, margin, critic: the parts.
-        has_fresh_weights: whether nothing was loaded or trained yet, whatever the configuration says of its weights.
+        lacks_weights: whether the configuration speaks of trained weights, and nothing was loaded or trained since.
 
     Raises:
         UntrainedFilterError: nothing says what actions and states look like.
@@ -89,7 +90,7 @@ class SafetyModel(nn.Module):
         config.change(world_model=self.world_model.config)
         self.margin = self.new_margin()
         self.critic = self.new_critic()
-        self.has_fresh_weights = True
+        self.lacks_weights = trained_on.has_reached("world_model")
         self.register_load_state_dict_post_hook(_has_loaded)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "SafetyModel":
@@ -145,11 +146,21 @@ class SafetyModel(nn.Module):
         """Numbers on this model's device; of 64-bit floats, which Apple's GPUs do not have, single ones."""
         return numbers.to(self.device, torch.float32) if numbers.is_floating_point() else numbers.to(self.device)
 
+    @property
+    def inputs(self) -> list[str]:
+        """Keys of an observation that are read."""
+        return [*self.world_model.image_keys, *([OBS_STATE] if self.units.state_names else [])]
+
+    def state(self, observation: dict[str, Tensor]) -> Tensor:
+        """Proprioception (B, S) in robot units; S is 0 where the model was trained without."""
+        if not self.units.state_names:
+            return torch.zeros(len(observation[self.world_model.image_keys[0]]), 0, device=self.device)
+        return self.place(observation[OBS_STATE]).float()
+
     def see(self, observation: dict[str, Tensor]) -> tuple[dict[str, Tensor], Tensor]:
         """Percepts and normalised proprioception (B, S) of a LeRobot batch of observations in robot units."""
         images = {key: self.images(self.place(observation[key])) for key in self.world_model.image_keys}
-        state = self.units.normalise_state(self.place(observation["observation.state"]))
-        return self.world_model.perceive(images), state
+        return self.world_model.perceive(images), self.units.normalise_state(self.state(observation))
 
     # -- deciding ---
 
@@ -205,7 +216,7 @@ class SafetyModel(nn.Module):
                 f"this filter's stage is {trained_on.stage!r}, {stage!r} is needed: its {part} was never "
                 f"trained. Run {command} first"
             )
-        if self.has_fresh_weights:
+        if self.lacks_weights:
             raise UntrainedFilterError(
                 "this filter has random weights: its configuration was read, its weights were not. Load both with "
                 "LatentSafePolicy.from_pretrained(folder), or set config.pretrained_path to the folder before "
@@ -225,9 +236,9 @@ class SafetyModel(nn.Module):
         correct = (((margin < 0) == (failure == 1)) & labelled).sum() / labelled.sum()
         if self.training:  # a critic of the world model before knows nothing of this one
             self.config.trained_on.stage = "world_model"
-            self.has_fresh_weights = False
+            self.lacks_weights = False
         return loss, features, {**metrics, "loss_margin": margin_loss, "margin_accuracy": correct}
 
 
 def _has_loaded(model: SafetyModel, incompatible: Any) -> None:
-    model.has_fresh_weights = False
+    model.lacks_weights = False

@@ -241,15 +241,15 @@ class Shield:
         Numbers of the state that are not usable are NaN; `pose` holds what was read of them before.
         """
         model, cameras = self.model, self.model.world_model.image_keys
-        missing = [k for k in (*cameras, "observation.state") if k not in observation]
+        missing = [key for key in model.inputs if key not in observation]
         if missing:
             raise KeyError(
                 f"observation lacks {', '.join(missing)}; this filter was trained on "
-                f"{', '.join(cameras)} and observation.state. Got "
+                f"{', '.join(model.inputs)}. Got "
                 f"{', '.join(k for k in observation if k.startswith('observation'))}. Rename the camera or state "
                 "(--rename_map), or train a filter for this robot"
             )
-        state = model.place(observation["observation.state"]).float()
+        state = model.state(observation)
         if self.executed is not None and len(self.executed) != len(state):
             raise ValueError(
                 f"the batch went from {len(self.executed)} to {len(state)} robots within an episode; "

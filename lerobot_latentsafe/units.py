@@ -18,7 +18,7 @@ RANGE_TOLERANCE = 0.1
 """Share of the data's range by which a command may leave it: it is clipped, and judged and executed as clipped."""
 STATE_TOLERANCE = 1.0
 """Share of the data's range by which a number of the state may leave it and still be believed."""
-STEP_TOLERANCE, MISSED_TICKS = 3.0, 3
+STEP_TOLERANCE, MISSED_TICKS = 2.0, 3
 """A number of the state that changes by more than so many of the data's largest steps since it was read last is not
 believed; if it could not be read meanwhile, so many ticks count at most."""
 LOUDEST = 4.0
@@ -121,6 +121,7 @@ class Units(nn.Module):
     frozen: Tensor
     stays: Tensor
     is_target: Tensor
+    _shown_by: Tensor
 
     def __init__(self, trained_on: TrainedOn, frozen_commands: list[str]):
         super().__init__()
@@ -278,5 +279,5 @@ class Units(nn.Module):
         widest = width.amax() if len(width) else width.sum()
         slack = STATE_TOLERANCE * torch.maximum(width, 0.1 * widest)
         near = state.isfinite() & (state >= self.state_low - slack) & (state <= self.state_high + slack)
-        step = STEP_TOLERANCE * torch.maximum(self.state_step, 0.02 * widest)
+        step = STEP_TOLERANCE * torch.maximum(self.state_step, 0.01 * widest)
         return near & ~((state - pose).abs() > step * (1 + missed.clamp(max=MISSED_TICKS)))

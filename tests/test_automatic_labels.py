@@ -16,6 +16,7 @@ from lerobot_latentsafe.dubins.labeller import dubins_truth
 from lerobot_latentsafe.labeling.automatic import (
     AnswerError,
     ChatEndpoint,
+    LabellerError,
     VisionLanguageLabeller,
     as_vector,
     find_labeller,
@@ -91,6 +92,59 @@ def test_labeller_without_its_column_says_so(dataset_root, tmp_path):
     store, frames = LabelStore(root, tiny.REPO_ID, ["entered"]), DatasetFrames(tiny.metadata(root))
     with pytest.raises(ValueError, match=r"reads the column 'observation.environment_state'.*observation.image"):
         label_automatically(store, frames, "entered", dubins_truth, "test")
+
+
+def test_each_answer_is_saved_before_the_next_is_asked_for(labelled, root):
+    run, store = labelled
+    known = []
+
+    def paid(episode):
+        on_disk = FailureLabels.load(root, "entered").failure if known else np.zeros(0)
+        known.append(int((on_disk >= 0).sum()))
+        if episode.number == 3:
+            raise KeyboardInterrupt  # as a kill would
+        return 1
+
+    with pytest.raises(KeyboardInterrupt):
+        run(paid)
+    assert known == [0, *np.cumsum(store.length[:3])]
+    assert run(lambda episode: 0)["labelled"] == [3]  # it goes on where it stopped
+
+
+def test_an_episode_that_fails_does_not_stop_the_others(labelled):
+    run, _ = labelled
+
+    def unsteady(episode):
+        if episode.number == 1:
+            raise ConnectionError("timed out")
+        return 0
+
+    result = run(unsteady)
+    assert result["labelled"] == [0, 2, 3] and result["failed"] == [(1, "ConnectionError: timed out")]
+
+
+def test_a_labeller_that_always_fails_is_not_asked_for_ever(labelled):
+    run, store = labelled
+    store.label("entered", 0, 0, "ann")
+    asked = []
+
+    def down(episode):
+        asked.append(episode.number)
+        raise ConnectionError("refused")
+
+    with pytest.raises(LabellerError, match=r"failed on 3 episodes in a row.*refused.*The 0 labels.*goes on there"):
+        run(down)
+    assert asked == [1, 2, 3]
+
+
+def test_what_got_no_label_is_told_by_the_exit_code(root, monkeypatch, capsys):
+    monkeypatch.setattr(
+        "lerobot_latentsafe.labeling.automatic.find_labeller", lambda name: lambda e: [0, -5][e.number % 2]
+    )
+    with pytest.raises(SystemExit, match="2 episodes got no label; the others are saved"):
+        main(["auto-label", "--labeller=any", f"--dataset.repo_id={tiny.REPO_ID}", f"--dataset.root={root}",
+              "--specification=entered"])  # fmt: skip
+    assert "episode 1: expected a frame from 0 to" in capsys.readouterr().out
 
 
 def test_a_model_sees_pictures_and_task(labelled, model):

@@ -10,7 +10,10 @@ import tiny
 import torch
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
+from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.processor import PolicyProcessorPipeline
+from lerobot.processor.converters import batch_to_transition
 
 from lerobot_latentsafe.cli import main
 from lerobot_latentsafe.datasets.build_cache import build_frame_cache
@@ -18,6 +21,7 @@ from lerobot_latentsafe.datasets.clips import FilterData
 from lerobot_latentsafe.datasets.contract import Contract
 from lerobot_latentsafe.datasets.folder import load_metadata, open_dataset
 from lerobot_latentsafe.datasets.reading import DatasetContractError
+from lerobot_latentsafe.processor_latentsafe import make_latentsafe_pre_post_processors
 from lerobot_latentsafe.runtime.hub import save_policy
 
 SHAPE = (3, world.HEIGHT, world.WIDTH)
@@ -88,8 +92,13 @@ def test_check_dataset_tells_what_to_know(capsys, tmp_path):
     root = world.record(tmp_path / "data", world.features(failure=None, **{"observation.state": None}))
     world.edit_feature(world.delete(root, "meta/stats.json"), "action", names=["all"])
     code, said = says(capsys, "check-dataset", f"--dataset.root={root}")
-    assert code == 0 and "no failure labels yet" in said.strip().splitlines()[-1]
-    for words in ("action_0, action_1 here", "without proprioception", "recompute_stats"):
+    assert code == 1 and "trained_on.meanings='{action_0: delta, action_1: delta}'" in said.strip().splitlines()[-1]
+    for words in (
+        "action_0, action_1 here",
+        "of unknown meaning",
+        "without proprioception",
+        "use_imagenet_stats=false",
+    ):
         assert words in said
 
 
@@ -183,6 +192,20 @@ def test_a_dataset_without_proprioception_is_cached_with_an_empty_state(tmp_path
     data = FilterData.open(cached(root, tmp_path / "cache"), "failure", None, SIZE)
     percepts, state = data.cache.frames(np.arange(3))
     assert state.shape == (3, 0) and percepts[world.CAMERA].shape == (3, 3, SIZE, SIZE)
+
+
+def test_cached_frames_without_proprioception_pass_lerobots_steps(tmp_path):
+    config = tiny.config(
+        trained_on_cameras=[world.CAMERA],
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (2,))},
+        input_features={world.CAMERA: PolicyFeature(FeatureType.VISUAL, SHAPE)},
+    )
+    before, _ = make_latentsafe_pre_post_processors(config)
+    before.save_pretrained(tmp_path)
+    again = PolicyProcessorPipeline.from_pretrained(tmp_path, f"{before.name}.json", to_transition=batch_to_transition)
+    batch = {"action": torch.zeros(4, 2), "index": torch.arange(4)}
+    for steps in (before, again):
+        assert steps(batch)["index"].tolist() == [0, 1, 2, 3]
 
 
 @pytest.mark.parametrize("kind", ["rssm", "gru", "dino_wm"])

@@ -134,7 +134,7 @@ REFUSED = {
         ["fps is '10'", "info.json"],
     ),
     "info cut": (lambda root: world.cut(plain(root), "meta/info.json"), ["info.json", "cut or damaged"]),
-    "statistics cut": (lambda root: world.cut(plain(root), "meta/stats.json"), ["stats.json", "recompute_stats"]),
+    "statistics cut": (lambda root: world.cut(plain(root), "meta/stats.json"), ["stats.json", "delete it"]),
     "tasks missing": (lambda root: world.delete(plain(root), "meta/tasks.parquet"), ["tasks.parquet is missing"]),
     "tasks cut": (lambda root: world.cut(plain(root), "meta/tasks.parquet"), ["tasks.parquet", "cut or damaged"]),
     "numbers cut": (lambda root: world.cut(plain(root), "data/*/*.parquet"), ["file-000.parquet", "cut or damaged"]),

@@ -139,7 +139,7 @@ def plain(kind: type) -> type:
 def is_known(option: str) -> bool:
     """Whether any command, script or other program has an option of this name."""
     return (
-        option in {*OTHERS, "help", "config_path"}
+        option in {*OTHERS, "help", "debug", "config_path"}
         or any(has_option(options_class(command), option.split("."), {}) for command in [*LEROBOT, *VERBS])
         or any(f'"--{option}"' in script.read_text() for script in (ROOT / "scripts").iterdir() if script.is_file())
     )
@@ -182,7 +182,7 @@ def wrong_command(words: list[str]) -> Iterator[str]:
 def wrong_options(command: str, options: type, words: list[str]) -> Iterator[str]:
     given = dict(word[2:].partition("=")[::2] for word in words if word.startswith("--"))
     for option in given:
-        ours = option in ("help", "config_path")
+        ours = option in ("help", "debug", "config_path")
         if not ours and not has_option(options, option.split("."), given):
             yield f"{command} has no option --{option}"
 

@@ -135,7 +135,7 @@ def test_an_arm_that_is_moved_away_by_hand_stays_where_it_is(arm):
 
 
 def test_a_reading_that_leaps_is_believed_only_if_time_has_passed(arm):
-    """From tick to tick the data change by 2 degrees, and three times as much is believed."""
+    """From tick to tick the data change by 2 degrees, and twice as much is believed."""
     leap = lambda degrees: arm.shield(seen(POSE + degrees), POSE + degrees).reason.item()  # noqa: E731
     assert leap(0.0) == Reason.PASSED
     assert leap(7.0) == Reason.OBSERVATION_OUT_OF_RANGE

@@ -1,5 +1,6 @@
 """The page's server: what it answers, what it refuses, and that nothing sent to it goes anywhere."""
 
+import itertools
 import random
 import shutil
 import socket
@@ -94,6 +95,26 @@ def test_frames_of_an_episode_are_its_pictures(client, server):
     assert n == server.store.length[2] and len(content) == 4 * (n + 1) + sum(sizes)
     last = cv2.imdecode(np.frombuffer(content[-sizes[-1] :], np.uint8), cv2.IMREAD_COLOR)
     assert np.array_equal(last[..., ::-1], server.frames.images("observation.image", 2)[-1])
+
+
+def pictures_of(content):
+    (n,) = struct.unpack_from("<I", content)
+    sizes = struct.unpack_from(f"<{n}I", content, 4)
+    ends = np.cumsum([4 * (n + 1), *sizes])
+    return [content[a:b] for a, b in itertools.pairwise(ends)]
+
+
+def test_pieces_of_an_episode_are_parts_of_the_whole(client, server):
+    whole, n = pictures_of(ask(client, "api/frames/0/2").content), int(server.store.length[2])
+    asked = {"first=0&count=3": range(3), "first=2": range(2, n), f"first={n - 1}&count=3": [n - 1], "count=0": [],
+             "spread=2": [int(0.5 * n / 2), int(1.5 * n / 2)], f"spread={n}": range(n)}  # fmt: skip
+    for query, numbers in asked.items():
+        assert pictures_of(ask(client, f"api/frames/0/2?{query}").content) == [whole[t] for t in numbers], query
+
+
+@pytest.mark.parametrize("query", ["first=-1", "first=99999", "count=99999", "spread=99999", "first=x", "spread=1e9"])
+def test_frames_that_are_not_there_are_refused(client, query):
+    assert ask(client, f"api/frames/0/2?{query}").status_code == 400
 
 
 def test_disk_that_is_full_is_told(client, server, monkeypatch):

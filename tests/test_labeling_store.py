@@ -123,10 +123,79 @@ def test_full_disk_changes_nothing(store, root, monkeypatch):
     assert store.undo("spilled")[1].first is None
 
 
+@pytest.mark.parametrize("step", ["fsync", "replace"])
+def test_a_disk_that_fails_at_any_step_changes_nothing(store, root, monkeypatch, step):
+    store.label("spilled", 3, 2, "ann")
+    kept = (root / "labels" / "spilled.parquet").read_bytes()
+
+    def full(*args):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(f"lerobot_latentsafe.runtime.files.os.{step}", full)
+    with pytest.raises(OSError, match="No space left"):
+        store.label("spilled", 3, 5, "ann")
+    monkeypatch.undo()
+    assert store.verdict("spilled", 3).first == 2
+    assert (root / "labels" / "spilled.parquet").read_bytes() == kept
+    assert sorted(p.name for p in (root / "labels").iterdir()) == [".lock", "spilled.parquet"]
+
+
 def test_second_process_is_kept_out(store, root):
     code = f"from lerobot_latentsafe.labeling.store import LabelStore; LabelStore({str(root)!r}, 'me/car', ['failure'])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode and "another process is labelling" in done.stderr
+
+
+def test_a_second_one_that_is_refused_does_not_break_a_save(store, root, monkeypatch):
+    write, refused = label_files.pq.write_table, []
+
+    def meanwhile(table, file, **options):
+        write(table, file, **options)
+        with pytest.raises(OSError, match="another process is labelling"):
+            LabelStore(root, tiny.REPO_ID, ["failure"])
+        refused.append(file)
+
+    monkeypatch.setattr(label_files.pq, "write_table", meanwhile)
+    store.label("spilled", 3, 2, "ann")
+    assert refused and FailureLabels.load(root, "spilled").failure.max() == 1
+
+
+def test_what_another_process_saved_last_is_read(store, root):
+    """Files are read when the folder is this process's, not before."""
+    store.label("spilled", 3, 2, "ann")
+    with pytest.raises(OSError, match="another process"):
+        LabelStore(root, tiny.REPO_ID, ["spilled"])
+    store.label("spilled", 4, 1, "ann")
+    again = reopened(store)
+    assert [again.verdict("spilled", e).first for e in (3, 4)] == [2, 1]
+    again.close()
+
+
+def test_a_store_that_cannot_be_opened_leaves_the_folder_free(store, root):
+    store.close()
+    (root / "labels" / "spilled.parquet").write_bytes(b"PAR1 torn")
+    with pytest.raises(LabelFileError, match="not a readable parquet"):
+        LabelStore(root, tiny.REPO_ID, ["failure"])
+    (root / "labels" / "spilled.parquet").unlink()
+    LabelStore(root, tiny.REPO_ID, ["failure"]).close()
+
+
+def test_a_kill_loses_no_label_that_was_confirmed(root):
+    code = f"""
+from lerobot_latentsafe.labeling.store import LabelStore
+store = LabelStore({str(root)!r}, 'me/car', ['spilled'])
+while True:
+    for episode in range(len(store)):
+        print(episode, store.label('spilled', episode, episode % 3, 'ann').first, flush=True)
+"""
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    confirmed = dict(map(int, process.stdout.readline().split()) for _ in range(9))
+    process.kill()
+    process.wait()
+    store = LabelStore(root, tiny.REPO_ID, ["spilled"])  # the lock went with the process
+    assert {e: store.verdict("spilled", e).first for e in confirmed} == confirmed
+    assert sorted(p.name for p in (root / "labels").iterdir()) == [".lock", "spilled.parquet"]
+    store.close()
 
 
 def test_folder_that_cannot_be_written_is_a_message(root, monkeypatch):

@@ -14,7 +14,7 @@ CAMERA = "observation.image"
 @pytest.fixture(params=[tiny.gru_config, tiny.dino_wm_config], ids=["gru", "dino_wm"])
 def policy(request, token_root):
     made = tiny.new_policy(tiny.metadata(token_root), world_model=request.param(), fallback_action_candidates=None)
-    made.config.trained_on.stage = "world_model"
+    made.config.trained_on.stage, made.model.has_fresh_weights = "world_model", False
     return made.eval()
 
 

@@ -107,7 +107,9 @@ def test_lerobot_discovers_policy_env_and_world_model(discovered, installed):
     assert "latentsafe" in discovered["policies"]
     assert {"latentsafe_dubins", "latentsafe_bag", "latentsafe_blocks", "latentsafe_so101"} <= set(discovered["envs"])
     assert {"latentsafe_franka_mujoco", "latentsafe_so101_mujoco", "latentsafe_shielded"} <= set(discovered["robots"])
-    assert {"latentsafe_scripted", "latentsafe_end_effector", "latentsafe_so101_leader"} <= set(discovered["teleoperators"])
+    assert {"latentsafe_scripted", "latentsafe_end_effector", "latentsafe_so101_leader"} <= set(
+        discovered["teleoperators"]
+    )
     assert "rssm" in discovered["world_models"]
     assert discovered["gym"] == [f"lerobot_latentsafe/{name}-v0" for name in ("Dubins", "Bag", "Blocks", "SO101")]
 

@@ -34,8 +34,9 @@ def test_without_its_packages_there_is_no_server(monkeypatch):
     serve_types(["latentsafe"])
 
 
-def test_a_filter_acts_on_the_server(tmp_path):
+def test_a_filter_acts_on_the_server(tmp_path, monkeypatch):
     pytest.importorskip("grpc")
+    monkeypatch.chdir(tmp_path)  # the server logs into a folder of where it is imported
     from lerobot.async_inference.configs import PolicyServerConfig
     from lerobot.async_inference.helpers import RemotePolicyConfig, TimedObservation
     from lerobot.async_inference.policy_server import PolicyServer

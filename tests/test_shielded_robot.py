@@ -579,6 +579,10 @@ class NameBack(Halve):
         return {name.removeprefix("tip_"): value for name, value in action.items()}
 
 
+def halved(frame):
+    return {**frame, "action": frame["action"] / 2}
+
+
 def pipeline(step):
     return RobotProcessorPipeline(
         [step], to_transition=robot_action_observation_to_transition, to_output=transition_to_robot_action
@@ -606,10 +610,13 @@ def alter(monkeypatch, how):
     elif how == "names":
         both = pipeline(Rename()), pipeline(NameBack())
         monkeypatch.setattr(lerobot_record, "make_default_processors", lambda: (*both, seen))
+    elif how == "the robot's names":
+        looping(robot_action_processor=pipeline(Rename()))
+    elif how == "the class of datasets":
+        add_half = type("Theirs", (LeRobotDataset,), {"add_frame": lambda self, f: self.writer.add_frame(halved(f))})
+        monkeypatch.setattr(lerobot_record, "LeRobotDataset", add_half)
     elif how == "the dataset":
-        monkeypatch.setattr(
-            LeRobotDataset, "add_frame", lambda self, frame: add(self, {**frame, "action": frame["action"] / 2})
-        )
+        monkeypatch.setattr(LeRobotDataset, "add_frame", lambda self, frame: add(self, halved(frame)))
 
 
 @pytest.mark.parametrize("how", ["processors of the operator", "processors of the robot", "the loop", "the command"])
@@ -627,7 +634,13 @@ def test_whatever_a_plugin_changes_the_dataset_holds_what_the_robot_was_sent(
 
 
 @pytest.mark.parametrize(
-    ("how", "words"), [("names", "was to be stored, and the robot was sent"), ("the dataset", "the robot executed")]
+    ("how", "words"),
+    [
+        ("names", "was to store tip_delta_x.*, and the robot was sent delta_x"),
+        ("the robot's names", "the operator commands tip_delta_x.*Nothing was sent"),
+        ("the dataset", r"was to store \[.*\], and the robot was sent \["),
+        ("the class of datasets", "the robot executed"),
+    ],
 )
 def test_a_recording_that_would_hold_something_else_is_refused(trained, tmp_path, monkeypatch, how, words):
     alter(monkeypatch, how)

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from lerobot_latentsafe.cli.options import DatasetSource
+from lerobot_latentsafe.datasets.adoption import meanings_of
 from lerobot_latentsafe.datasets.overview import (
     Row,
     advice,
@@ -62,6 +63,7 @@ class CheckDataset:
                 f"{meta.repo_id} has no camera that a filter could see by (left out: {known}); record one that shows "
                 "colours or grey"
             )
+        meanings_of(contract)
         if not labels:
             return "can be used: it has no failure labels yet; latentsafe label makes them"
         return "can be used: numbers, pictures and labels are whole"

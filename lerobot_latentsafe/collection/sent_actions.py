@@ -12,6 +12,8 @@ import numpy as np
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import ACTION
 
+from lerobot_latentsafe._compat import last_added
+
 
 @contextmanager
 def storing_what_was_sent(take_sent: Callable[[], dict[str, float] | None]) -> Iterator[None]:
@@ -21,19 +23,27 @@ def storing_what_was_sent(take_sent: Callable[[], dict[str, float] | None]) -> I
         take_sent: gives that action by name, in robot units, and forgets it; None if nothing was sent.
 
     Raises:
-        ValueError: before a frame is stored: nothing was sent, or the dataset is to hold other commands.
+        ValueError: before an episode is stored: nothing was sent, the dataset is to hold other commands, or something
+            else changes what it holds.
     """
     add = LeRobotDataset.add_frame
 
     def add_sent(dataset: LeRobotDataset, frame: dict) -> None:
         names, sent = dataset.features[ACTION]["names"], take_sent()
         if sent is None or set(names) != set(sent):
-            raise ValueError(
-                f"a frame with the commands {', '.join(names)} was to be stored, and the robot was sent "
-                f"{', '.join(sent) if sent else 'nothing'}. Something replaces LeRobot's processors: record without "
-                "that plugin. Nothing of this episode was stored"
-            )
-        add(dataset, {**frame, ACTION: np.array([sent[name] for name in names], np.float32)})
+            _refuse(", ".join(names), ", ".join(sent) if sent else "nothing")
+        action = np.array([sent[name] for name in names], np.float32)
+        add(dataset, {**frame, ACTION: action})
+        stored = last_added(dataset, ACTION)
+        if not np.array_equal(stored, action):
+            _refuse(str(stored), str(action))
 
     with patch.object(LeRobotDataset, "add_frame", add_sent):
         yield
+
+
+def _refuse(stored: str, sent: str) -> None:
+    raise ValueError(
+        f"a frame was to store {stored}, and the robot was sent {sent}. A plugin changes what LeRobot stores: record "
+        "without it. Nothing of this episode was stored"
+    )

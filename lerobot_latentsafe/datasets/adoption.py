@@ -49,14 +49,21 @@ def adopt_dataset(known: TrainedOn, contract: Contract) -> TrainedOn:
     return adopted
 
 
+def told_by(contract: Contract) -> list[Command]:
+    """Each command of a dataset and what it means, as far as names and data tell."""
+    return tell_meanings(contract.state_names, contract.action_names, contract.state, contract.action, contract.episode)
+
+
 def meanings_of(contract: Contract, by_hand: dict[str, str] | None = None) -> list[Command]:
     """Each command of a dataset and what it means.
+
+    Args:
+        by_hand: command -> meaning, of those that names and data do not tell, or tell wrongly.
 
     Raises:
         MeaningError: one cannot be told.
     """
-    told = tell_meanings(contract.state_names, contract.action_names, contract.state, contract.action, contract.episode)
-    return settle(told, by_hand, contract.state_names, contract.repo_id)
+    return settle(told_by(contract), by_hand, contract.state_names, contract.repo_id)
 
 
 def _first_dataset(trained_on: TrainedOn, contract: Contract) -> TrainedOn:
@@ -116,8 +123,7 @@ def _with_ranges(trained_on: TrainedOn, contract: Contract, commands: list[Comma
 
 def _check_meanings(trained_on: TrainedOn, contract: Contract) -> None:
     """Refuse a dataset whose commands mean something else than those trained on."""
-    told = tell_meanings(contract.state_names, contract.action_names, contract.state, contract.action, contract.episode)
-    if wrong := contradictions(trained_on.commands, told):
+    if wrong := contradictions(trained_on.commands, told_by(contract)):
         raise ValueError(
             f"{contract.repo_id} is of a robot that takes other commands: {'; '.join(wrong)}. Use a dataset of the "
             "same kind of commands, or train a new filter"

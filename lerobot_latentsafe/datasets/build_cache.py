@@ -48,6 +48,8 @@ from lerobot_latentsafe.runtime.malloc import keep_freed_memory
 LAYOUT, DONE = "layout.json", "done.npy"
 ENCODED_AT_ONCE = 8
 """Frames an encoder reads together: few enough for its activations to stay in a CPU's cache."""
+TOGETHER = 2**21
+"""Numbers of pictures that are made small together."""
 SAMPLED_EPISODES, SAMPLED_FRAMES = 100, 4000
 """From which principal components are found."""
 
@@ -66,7 +68,12 @@ class Sight:
     def pieces(self, place: int, numbers: Sequence[int] | None = None) -> Iterator[dict[str, Tensor]]:
         """Of all its frames, or of some, in order: camera key -> (n, 3, S, S) in [0, 1]."""
         for piece in self.frames.pieces(self.frames.cameras, self.frames.episodes[place], numbers):
-            yield {key: to_model_images(images, self.image_size) for key, images in piece.items()}
+            yield {key: self._small(images) for key, images in piece.items()}
+
+    def _small(self, images: Tensor) -> Tensor:
+        """Large ones one by one: in floats, a picture is a hundred times as large as what becomes of it."""
+        parts = images.split(max(1, TOGETHER // images[0].numel()))
+        return torch.cat([to_model_images(part, self.image_size) for part in parts])
 
 
 class Recipe(Protocol):
@@ -155,7 +162,7 @@ class Tokens:
         tokens = []
         for episode in episodes:
             picked = rng.permutation(see.length(episode))[: -(-SAMPLED_FRAMES // len(episodes))]
-            tokens += [self._tokens(images) for images in see.pieces(episode, np.sort(picked))]
+            tokens += [self._tokens(images) for images in see.pieces(episode, np.sort(picked).tolist())]
         torch.manual_seed(0)
         self.perception.basis.fit(torch.cat(tokens))
         save_file(self.perception.basis.state_dict(), folder / BASIS)
@@ -255,7 +262,7 @@ def _fill(copy: LeRobotDatasetMetadata, kept: Recipe, see: Sight) -> bool:
     return bool(done.all())
 
 
-def _array(folder: Path, name: str) -> np.ndarray:
+def _array(folder: Path, name: str) -> np.memmap:
     """An array to write into; what was written leaves this process's memory with it."""
     return np.load(folder / f"{name}.npy", mmap_mode="r+")
 

@@ -15,7 +15,7 @@ from lerobot_latentsafe.datasets.video_frames import video_frames
 
 MAX_HEIGHT = 480
 """Rows of a frame sent to the page."""
-AT_ONCE = 16
+AT_ONCE = 8
 """Frames of each camera that are held together while an episode runs through."""
 
 

@@ -15,6 +15,10 @@ import pyarrow.parquet as pq
 from lerobot_latentsafe.datasets.reading import DOWNLOAD_AGAIN, BrokenFileError, DatasetContractError, reading, some
 
 INFO, STATISTICS, TASKS, EPISODES = "meta/info.json", "meta/stats.json", "meta/tasks.parquet", "meta/episodes"
+NO_STATISTICS = (
+    "give lerobot-train --dataset.use_imagenet_stats=false, as a filter needs no statistics; or run latentsafe cache "
+    "and train on that"
+)
 CONVERTER = "python -m lerobot.scripts.convert_dataset_v21_to_v30"
 
 
@@ -32,7 +36,7 @@ def check_layout(root: Path) -> dict[str, Any]:
         _check_readable(root.glob("/".join(table)))
     _check_episodes(root, info["total_episodes"])
     if (root / STATISTICS).exists():
-        with reading(root / STATISTICS, "delete it; lerobot-edit-dataset --operation.type=recompute_stats makes one"):
+        with reading(root / STATISTICS, f"delete it, and {NO_STATISTICS}"):
             json.loads((root / STATISTICS).read_text())
     return info
 
@@ -115,10 +119,10 @@ def check_for_lerobot(root: Path, imagenet_statistics: bool) -> None:
     """
     info = check_layout(root)
     cameras = [key for key, feature in info["features"].items() if feature["dtype"] in ("image", "video")]
-    if cameras and imagenet_statistics and not (root / STATISTICS).exists():
+    if imagenet_statistics and lacks_statistics(root, cameras):
         raise DatasetContractError(
-            f"{root / STATISTICS} is missing, which lerobot-train writes to. Give --dataset.use_imagenet_stats=false, "
-            "as a filter needs no statistics of pictures; or run latentsafe cache and train on that"
+            f"{root / STATISTICS} is missing or lacks a camera, and lerobot-train would write ImageNet's there; "
+            f"{NO_STATISTICS}"
         )
     for key in cameras:
         if len(info["features"][key].get("names") or []) != 3:
@@ -128,3 +132,10 @@ def check_for_lerobot(root: Path, imagenet_statistics: bool) -> None:
             )
         if info["features"][key]["dtype"] == "video" and not any(root.glob(f"videos/{key}/*/*.mp4")):
             raise BrokenFileError(f"{root / 'videos' / key} holds no video; {DOWNLOAD_AGAIN}")
+
+
+def lacks_statistics(root: Path, cameras: Iterable[str]) -> bool:
+    """Whether a dataset has no statistics of one of its cameras."""
+    path = root / STATISTICS
+    known = json.loads(path.read_text()) if path.exists() else {}
+    return any(key not in known for key in cameras)

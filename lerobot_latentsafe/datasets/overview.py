@@ -6,11 +6,12 @@ import numpy as np
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.video_utils import decode_video_frames
 
+from lerobot_latentsafe.datasets.adoption import displacements, told_by
 from lerobot_latentsafe.datasets.cameras import stored_picture
 from lerobot_latentsafe.datasets.contract import ACTION, STATE, Contract
 from lerobot_latentsafe.datasets.frame_cache import FOLDER, FrameCache
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE, UNLABELLED, all_labels
-from lerobot_latentsafe.datasets.layout import INFO, STATISTICS
+from lerobot_latentsafe.datasets.layout import INFO, NO_STATISTICS, STATISTICS, lacks_statistics
 from lerobot_latentsafe.datasets.names import usable_names
 from lerobot_latentsafe.datasets.reading import reading
 
@@ -34,13 +35,19 @@ def rows(contract: Contract) -> list[Row]:
     ]
     table += [("camera", f"{key}: {c} channels, {h} x {w} pixels") for key, (c, h, w) in contract.cameras.items()]
     table += [("left out", f"{key}: {why}") for key, why in contract.left_out.items()]
-    for what, names, numbers in (
-        ("state", contract.state_names, contract.state),
-        ("command", contract.action_names, contract.action),
-    ):
-        table += [
-            (what, f"{name}: {low:g} to {high:g}") for name, low, high in zip(names, numbers.min(0), numbers.max(0))
-        ]
+    spans = zip(contract.state_names, contract.state.min(0), contract.state.max(0))
+    table += [("state", f"{name}: {low:g} to {high:g}") for name, low, high in spans]
+    return table + command_rows(contract)
+
+
+def command_rows(contract: Contract) -> list[Row]:
+    """What each command means, as far as names and data tell, and how far it goes."""
+    commands = told_by(contract)
+    sent, moves, table = contract.action, displacements(contract, commands), []
+    for command, low, high, least, largest in zip(commands, sent.min(0), sent.max(0), moves.min(0), moves.max(0)):
+        meaning = command.described if command.meaning else "of unknown meaning"
+        meaning += f", at {least:+.3g} to {largest:+.3g} from the state" if command.of_state else ""
+        table.append(("command", f"{command.name}: {low:g} to {high:g}, {meaning}"))
     return table
 
 
@@ -105,11 +112,8 @@ def advice(meta: LeRobotDatasetMetadata, contract: Contract) -> Iterator[str]:
             )
     if not contract.state_names:
         yield f"there is no {STATE}: a filter sees pictures alone, without proprioception"
-    if not (meta.root / STATISTICS).exists():
-        yield (
-            f"{STATISTICS} is missing: the filter needs none, but lerobot-train does. Run latentsafe cache and train "
-            "on that, or lerobot-edit-dataset --operation.type=recompute_stats --operation.overwrite=true"
-        )
+    if lacks_statistics(meta.root, meta.camera_keys):
+        yield f"{STATISTICS} is missing or lacks a camera: {NO_STATISTICS}"
     if any(key in meta.video_keys for key in contract.cameras) and contract.seconds_apart > ON_TIME:
         yield f"timestamps are off: give lerobot-train --tolerance_s={2 * contract.seconds_apart:.2g}"
     for key in contract.cameras:

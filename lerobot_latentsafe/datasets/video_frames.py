@@ -1,6 +1,7 @@
 """Frames of a video one after the other, in constant memory: those that LeRobot's `decode_video_frames` would give."""
 
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 
 import av
@@ -18,8 +19,7 @@ def video_frames(path: str | Path, times: Sequence[float], tolerance_s: float) -
     Raises:
         FrameTimestampError: no frame is so near to one of the times.
     """
-    with av.open(str(path)) as container:
-        reader = _Reader(container)
+    with av.open(str(path)) as container, closing(_Reader(container)) as reader:
         for time in times:
             frame = reader.nearest(time)
             # Rounded as LeRobot rounds, so that the same frames are near enough.
@@ -39,7 +39,9 @@ class _Reader:
         self.container, self.stream = container, container.streams.video[0]
         self.group = np.inf  # seconds between frames that can be decoded alone, as far as seen
         self.key: float | None = None
-        self.before = self.after = self.frames = None
+        self.before: av.VideoFrame | None = None
+        self.after: av.VideoFrame | None = None
+        self.frames: Iterator[av.VideoFrame] | None = None
 
     def nearest(self, time: float) -> av.VideoFrame | None:
         """Of the frames at and around a time; None after the end."""
@@ -58,6 +60,10 @@ class _Reader:
         self.container.seek(ticks, backward=True, any_frame=False, stream=self.stream)
         self.before = self.after = self.key = None
         self.frames = self._decoded()
+
+    def close(self) -> None:
+        """Let go of the frames: a reader and what it decodes hold each other, and pictures are large."""
+        self.before = self.after = self.frames = None
 
     def _decoded(self) -> Iterator[av.VideoFrame]:
         for frame in self.container.decode(self.stream):

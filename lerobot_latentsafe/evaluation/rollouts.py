@@ -213,7 +213,7 @@ def check_environment(policy: LatentSafePolicy, env: EnvConfig) -> None:
             f"environment {env.type} takes actions of shape {tuple(features['action'].shape)}, the filter "
             f"{len(trained_on.action_low)}: {', '.join(trained_on.action_names)}"
         )
-    missing = [key for key in (*trained_on.cameras, "observation.state") if key not in features]
+    missing = [key for key in policy.model.inputs if key not in features]
     if missing:
         raise ValueError(f"environment {env.type} lacks {', '.join(missing)}; it offers {', '.join(features)}")
 
@@ -247,7 +247,8 @@ def _run_together(
         alive, filmed = step.alive, np.flatnonzero(step.alive[:n_videos])
         if seen is not None and len(filmed):
             images = {key: values[filmed] for key, values in step.seen.items() if key.startswith(OBS_IMAGE)}
-            seen.add([runs.frames[i][-1] for i in filmed], images, step.seen[OBS_STATE][filmed])
+            state = step.seen.get(OBS_STATE, torch.zeros(len(alive), 0))[filmed]
+            seen.add([runs.frames[i][-1] for i in filmed], images, state)
         runs.steps[alive] += 1
         if step.decision is not None:
             _note_decision(runs, step.decision, alive)

@@ -1,6 +1,7 @@
-"""Scenes of the simulated Franka as worlds, and scripted operators as actors, for whoever drives episodes of them."""
+"""Scenes of the simulated arms as worlds, and scripted operators as actors, for whoever drives episodes of them."""
 
 from collections.abc import Sequence
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -8,10 +9,26 @@ from torch import Tensor
 
 from lerobot_latentsafe.evaluation.rollouts import Choice
 from lerobot_latentsafe.franka.behaviors import Actions
-from lerobot_latentsafe.franka.scene import CAMERAS, FrankaScene
+from lerobot_latentsafe.franka.scene import CAMERAS
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 
 FRONT = "observation.images.front"
+
+
+class Scene(Protocol):
+    """What a simulated arm and its surroundings have."""
+
+    def truth(self) -> dict[str, Any]:
+        """What only a simulation knows."""
+
+    def render(self, camera: str) -> np.ndarray:
+        """A picture (H, W, 3), uint8."""
+
+    def proprioception(self) -> np.ndarray:
+        """The state (S,), float32."""
+
+    def step(self, action: np.ndarray) -> None:
+        """Advance one control step under an action (A,)."""
 
 
 class SceneWorld:
@@ -22,7 +39,7 @@ class SceneWorld:
         cameras: those that somebody looks through; drawing takes most of the time.
     """
 
-    def __init__(self, scene: FrankaScene, n_steps: int, cameras: Sequence[str] = CAMERAS):
+    def __init__(self, scene: Scene, n_steps: int, cameras: Sequence[str] = CAMERAS):
         self.scene, self.left, self.cameras = scene, n_steps, cameras
         self.info = scene.truth()
 
@@ -40,7 +57,7 @@ class SceneWorld:
         return {**images, "observation.state": torch.from_numpy(self.scene.proprioception())[None]}
 
     def step(self, action: np.ndarray) -> None:
-        """Act (1, 7) in robot units."""
+        """Act (1, A) in robot units."""
         self.scene.step(np.asarray(action[0], float))
         self.info, self.left = self.scene.truth(), self.left - 1
 

@@ -9,8 +9,6 @@ import json
 import secrets
 import socket
 import struct
-import threading
-from collections import OrderedDict
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -35,8 +33,6 @@ STATIC = {
 MAX_BODY = 4096
 PIECE = 32
 """Frames that the page asks for together."""
-KEPT_BYTES = 256 * 2**20
-"""Of pictures, for pages that ask again."""
 HEADERS = {
     "Cache-Control": "no-store",
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
@@ -106,8 +102,6 @@ class LabelServer:
     def __init__(self, store: LabelStore, frames: DatasetFrames, user: str, suggester: Suggester | None = None):
         self.store, self.frames, self.user, self.suggester = store, frames, user, suggester
         self.changes: list[tuple[str | None, int]] = []
-        self._packed: OrderedDict[tuple, bytes] = OrderedDict()
-        self._keeping = threading.Lock()
 
     def app(self, token: str, hosts: set[str]) -> Guard:
         """The ASGI application."""
@@ -184,12 +178,14 @@ class LabelServer:
         length, asked = int(self.store.length[episode]), request.query_params
         if "spread" in asked:
             spread = _number(asked["spread"], "spread", length)
-            numbers = tuple(int((i + 0.5) * length / spread) for i in range(spread))
+            numbers = [int((i + 0.5) * length / spread) for i in range(spread)]
         else:
             first = _number(asked.get("first", 0), "first", length - 1)
             count = _number(asked.get("count", length), "count", length)
-            numbers = tuple(range(first, min(first + count, length)))
-        return Response(self._pack(camera, episode, numbers), media_type="application/octet-stream")
+            numbers = [*range(first, min(first + count, length))]
+        pictures = self.frames.encoded(self.frames.cameras[camera], episode, numbers)
+        sizes = struct.pack(f"<{len(pictures) + 1}I", len(pictures), *map(len, pictures))
+        return Response(sizes + b"".join(pictures), media_type="application/octet-stream")
 
     def margin(self, request: Request) -> Response:
         """The filter's margin along an episode, if it has judged it."""
@@ -222,21 +218,6 @@ class LabelServer:
             entry |= {"guess": known.guess, "usefulness": round(known.usefulness, 3)}
             entry |= {"contradiction": round(contradiction(known.margin, labels), 3)}
         return entry
-
-    def _pack(self, camera: int, episode: int, numbers: tuple[int, ...]) -> bytes:
-        key = (camera, episode, numbers)
-        with self._keeping:
-            if key in self._packed:
-                self._packed.move_to_end(key)
-                return self._packed[key]
-        pictures = self.frames.encoded(self.frames.cameras[camera], episode, numbers)
-        sizes = struct.pack(f"<{len(pictures) + 1}I", len(pictures), *map(len, pictures))
-        packed = sizes + b"".join(pictures)
-        with self._keeping:
-            self._packed[key] = packed
-            while sum(map(len, self._packed.values())) > KEPT_BYTES:
-                self._packed.popitem(last=False)
-        return packed
 
 
 async def _body(request: Request) -> dict:

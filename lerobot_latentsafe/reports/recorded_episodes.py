@@ -1,6 +1,6 @@
 """What `latentsafe record` stored under a filter, read back as episodes that a report can show."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from lerobot_latentsafe.latent import map_latent
 from lerobot_latentsafe.safety_model import SafetyModel
 
 
-class Pictures(Sequence):
+class Pictures:
     """One camera's frames of an episode, decoded whenever somebody looks at them."""
 
     def __init__(self, frames: DatasetFrames, camera: str, episode: int):
@@ -48,7 +48,8 @@ class RecordedEpisodes:
         stored = read_frames(frames.root, ["frame_index", "action", "observation.state"])
         meant = np.isin(stored["episode_index"], frames.episodes)
         stored = {name: column[meant] for name, column in stored.items()}
-        self.episode, self.executed, self.state = (stored[k] for k in ("episode_index", "action", "observation.state"))
+        self.episode, self.executed = stored["episode_index"], stored["action"]
+        self.state = stored.get("observation.state", np.zeros((len(self.episode), 0)))
         self.decisions = decision_columns(frames.root / FILE, stored)
 
     @staticmethod
@@ -68,6 +69,6 @@ class RecordedEpisodes:
             success=no, violation=no, steps=np.array([length]), overridden=np.array([sum(trace["intervened"])]),
             action_change=np.array([change.sum()]), severity=np.full(1, np.nan),
             traces=[{**trace, "action": self.executed[rows].tolist()}],
-            frames=[Pictures(self.frames, self.model.config.trained_on.cameras[0], episode)],
+            frames=[Pictures(self.frames, self.model.config.trained_on.cameras[0], episode)],  # type: ignore[list-item]
             latents=[[map_latent(latents, lambda z, t=t: z[:, t]) for t in range(length)]],
         )  # fmt: skip

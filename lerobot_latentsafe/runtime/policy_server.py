@@ -1,4 +1,4 @@
-"""LeRobot's server of policies for robots elsewhere has a list of the types it serves, and asks no plugin."""
+"""LeRobot's asynchronous policy server has a list of the types it serves, and asks no plugin."""
 
 
 def serve_types(types: list[str]) -> None:

@@ -95,7 +95,7 @@ class LatentSafeDreamerPolicy(PreTrainedPolicy):
     def _seen_commands(self, batch: dict[str, Tensor]) -> Tensor:
         """What the state shows of commands of the same name: (B, A), inside; zero of others."""
         units = self.model.units
-        shown = units.seen(self.model.place(batch["observation.state"]).float())
+        shown = units.seen(self.model.state(batch))
         return units.normalise_action(shown.clamp(units.action_low, units.action_high)).nan_to_num(0.0)
 
     def was_overridden(self, executed: Tensor) -> None:

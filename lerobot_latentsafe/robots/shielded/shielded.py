@@ -161,7 +161,15 @@ class LatentSafeShielded(Robot):
 
         Returns:
             What was executed.
+
+        Raises:
+            ValueError: while it records, a command that is not the robot's; nothing was sent.
         """
+        if self.journal and not self._between and set(action) != set(self.action_features):
+            raise ValueError(
+                f"the operator commands {', '.join(action)}; {self.name} takes {', '.join(self.action_features)}. "
+                "Nothing was sent; use a teleoperator of this robot"
+            )
         shield, names = self.filter.shield, self._trained_on.action_names
         before = shield.decision
         sent = self.inner.send_action(self._decide(action))
@@ -288,7 +296,7 @@ class LatentSafeShielded(Robot):
             last = self._cameras.get(key)
             if last is None or not np.array_equal(last["picture"], picture):
                 self._cameras[key] = {"picture": picture, "at": now, "state": state, "repeats": 0}
-            elif (state - last["state"]).abs().max() > MOVED:
+            elif ((state - last["state"]).abs() > MOVED).any():
                 last["repeats"] += 1
 
     def _age(self, now: float) -> float:

@@ -1,0 +1,113 @@
+"""What a filter takes over from the first dataset, and what it refuses of later ones."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from test_meanings import JOINTS, followed, moved_by, so101, uniform, walk
+
+from lerobot_latentsafe.datasets.adoption import adopt_dataset, check_candidates
+from lerobot_latentsafe.datasets.contract import Contract
+from lerobot_latentsafe.meanings import MeaningError
+from lerobot_latentsafe.units import TrainedOn, Units
+
+
+def contract(state, action, names=JOINTS, repo_id="me/arm"):
+    numbers = (np.asarray(values, np.float32) for values in (state, action))
+    episode = np.arange(len(state)) // 200
+    return Contract(repo_id, Path(), "so101_follower", 30, list(names), list(names), {}, {}, episode, *numbers)
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return contract(*so101())
+
+
+def test_targets_are_scaled_by_their_displacements(arm):
+    trained_on = adopt_dataset(TrainedOn(), arm)
+    assert trained_on.meanings == dict.fromkeys(JOINTS, "target")
+    moves = np.abs(arm.action - arm.state)
+    np.testing.assert_allclose(trained_on.displacement_scale[:4], np.percentile(moves, 99, 0)[:4], rtol=1e-5)
+    np.testing.assert_allclose(trained_on.displacement_high[:4], (arm.action - arm.state).max(0)[:4], rtol=1e-5)
+    units = Units(trained_on, [])
+    heard = units.heard_action(torch.from_numpy(arm.action), torch.from_numpy(arm.state))
+    assert (heard.abs() <= 1).float().mean() > 0.98 and heard.std(0)[:4].min() > 0.2
+    assert trained_on.action_varies == [True] * 6  # a joint whose target is always the same still has displacements
+
+
+def test_a_jerk_of_the_operator_does_not_make_all_else_inaudible(arm):
+    jerked = arm.action.copy()
+    jerked[300] += 90
+    before, after = (adopt_dataset(TrainedOn(), c) for c in (arm, replace(arm, action=jerked)))
+    np.testing.assert_allclose(after.displacement_scale, before.displacement_scale, rtol=0.2)
+
+
+def test_a_joint_that_never_moves_is_not_blown_up():
+    state, target = so101()
+    state[:, 4] = target[:, 4] = 20.0
+    trained_on = adopt_dataset(TrainedOn(), contract(state, target))
+    assert trained_on.action_varies[4] is False and trained_on.displacement_scale[4] > 0.01
+    units = Units(trained_on, [])
+    pose = torch.tensor(state[:1], dtype=torch.float32)
+    clipped, out = units.clip(pose.clone(), pose)
+    torch.testing.assert_close(clipped, pose)
+    assert not out.any()
+
+
+def test_what_nobody_tells_is_refused_before_training_and_taken_from_the_user():
+    noise = contract(uniform(600, 2), uniform(600, 2)[::-1], ["x.pos", "y.pos"])
+    with pytest.raises(
+        MeaningError, match=r"of me/arm tell what x.pos, y.pos means.*meanings='\{x.pos: delta, y.pos: delta\}'"
+    ):
+        adopt_dataset(TrainedOn(), noise)
+    said = {"x.pos": "delta", "y.pos": "other"}
+    assert adopt_dataset(TrainedOn(meanings=said), noise).meanings == said
+
+
+def test_a_target_whose_state_has_another_name_is_found():
+    state, target = followed(walk(2, 0.8) + 50), walk(2, 0.8) + 50
+    other = replace(contract(state, target, ["a", "b"]), state_names=["s.pos", "t.pos"])
+    trained_on = adopt_dataset(TrainedOn(), other)
+    assert trained_on.meanings == {"a": "target s.pos", "b": "target t.pos"}
+    units, pose = Units(trained_on, []), torch.tensor([[48.0, 52.0]])
+    torch.testing.assert_close(units.hold(pose), pose)
+
+
+def test_later_datasets_must_mean_the_same(arm):
+    trained_on = adopt_dataset(TrainedOn(), arm)
+    assert adopt_dataset(trained_on, replace(arm, repo_id="me/more")) == trained_on
+    deltas = uniform(600, 6)
+    other = contract(moved_by(deltas), deltas, repo_id="me/deltas")
+    with pytest.raises(ValueError, match=r"me/deltas is of a robot that takes .*: shoulder_pan\.pos is a delta"):
+        adopt_dataset(trained_on, other)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (dict(fps=15), "has fps = 15, this filter was trained with 30"),
+        (dict(action_names=JOINTS[::-1]), "has action_names = "),
+        (dict(action=np.float32(1) * so101()[1] / 57.3), "reaches from .*another unit"),
+    ],
+)
+def test_other_robots_are_refused(arm, changes, message):
+    trained_on = adopt_dataset(TrainedOn(), arm)
+    other = replace(arm, **{name: np.float32(v) if name == "action" else v for name, v in changes.items()})
+    if "action" in changes:
+        other = replace(other, state=np.float32(arm.state / 57.3))
+    with pytest.raises(ValueError, match=message):
+        adopt_dataset(trained_on, other)
+
+
+def test_rates_may_be_fractions(arm):
+    assert adopt_dataset(TrainedOn(), replace(arm, fps=29.97)).fps == 29.97
+    assert str(TrainedOn(fps=15.0).fps) == "15"
+
+
+def test_candidates_of_targets_are_displacements(arm):
+    trained_on = adopt_dataset(TrainedOn(), arm)
+    check_candidates([[0.0] * 6, [1.0, 0, 0, 0, 0, 0]], trained_on, "me/arm")
+    with pytest.raises(ValueError, match="outside of what me/arm covers"):
+        check_candidates([[-70.0, 0, 0, 0, 0, 0]], trained_on, "me/arm")
