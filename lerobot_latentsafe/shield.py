@@ -43,6 +43,9 @@ class Shield:
         missed: (B, S), ticks since then.
         told: (B, A) in robot units, what the robots were told last.
         executed: (B, A), the same as the world model hears it.
+        moving: bool (B, A), whether what each target is of has moved since the last tick.
+        stay: (B, A) in robot units, what would have been to stay at the last tick.
+        holding: bool (B, A), commands that were told to stay.
     """
 
     def __init__(self, model: SafetyModel, clock: Callable[[], float] = time.perf_counter):
@@ -68,6 +71,9 @@ class Shield:
         self.missed: Tensor | None = None
         self.told: Tensor | None = None
         self.executed: Tensor | None = None
+        self.moving: Tensor | None = None
+        self.stay: Tensor | None = None
+        self.holding: Tensor | None = None
         self.decision: FilterDecision | None = None
         self.decided_at: float | None = None
         self.recent: Tensor | None = None
@@ -122,6 +128,7 @@ class Shield:
         self.recent = torch.cat([self.recent[:, 1:], acts[:, None]], 1)
         self.retreated = (self.retreated + 1) * (acts & retreats)
         self.belief, self.decision, self.decided_at = belief, decision, finished
+        self.stay = hold
         self.was_executed(decision.action)
         self._tell(decision)
         return decision
@@ -149,6 +156,7 @@ class Shield:
     def was_executed(self, action: Tensor) -> None:
         """Remember (B, A) in robot units as what was done; call it where something else was than was decided."""
         self.told, self.executed = action, self._hear(action)
+        self.holding = None if self.stay is None else torch.isclose(action, self.stay)
 
     def _hear(self, action: Tensor) -> Tensor:
         """An action (B, A) in robot units as the world model hears it; what is not known does not move."""
@@ -262,6 +270,7 @@ class Shield:
             self.pose, self.missed = torch.full_like(state, torch.nan), torch.zeros_like(state)
         usable = model.units.believable(state, self.pose, self.missed)
         state = torch.where(usable, state, torch.nan)
+        self.moving = model.units.moves(state, self.pose)
         self.pose, self.missed = torch.where(usable, state, self.pose), (self.missed + 1) * ~usable
         for key in cameras:
             image = model.place(observation[key])
@@ -349,7 +358,8 @@ class Shield:
 
     def _hold(self, state: Tensor) -> Tensor:
         """Stay: (B, A) in robot units."""
-        hold = self.model.units.hold(state, self.told)
+        settled = ~self.moving if self.holding is None else ~self.moving | self.holding
+        hold = self.model.units.hold(state, self.told, settled)
         if not hold.isfinite().all() and self.model.config.law.mode != "monitor":
             raise UnknownPoseError(
                 "the first observation of the episode shows no usable state, and these commands are positions: nobody "

@@ -21,6 +21,8 @@ STATE_TOLERANCE = 1.0
 STEP_TOLERANCE, MISSED_TICKS = 2.0, 3
 """A number of the state that changes by more than so many of the data's largest steps since it was read last is not
 believed; if it could not be read meanwhile, so many ticks count at most."""
+AT_REST = 0.1
+"""A number of the state that changes by less than this share of the data's largest step does not move."""
 LOUDEST = 4.0
 """Inside, a displacement of the 99th percentile is 1; the rare larger ones are heard as this at most."""
 
@@ -235,16 +237,18 @@ class Units(nn.Module):
             high = torch.where(self.is_target, torch.minimum(torch.maximum(high, pose), furthest), high)
         return torch.minimum(torch.maximum(action, low), high), far.any(-1)
 
-    def hold(self, state: Tensor, told: Tensor | None = None) -> Tensor:
+    def hold(self, state: Tensor, told: Tensor | None = None, settled: Tensor | None = None) -> Tensor:
         """What to do when nothing can be known: stay (B, A), in robot units.
 
-        A target stays what was commanded last, if the robot is near it, so that an arm does not sink under its weight
-        and a gripper keeps its grip; else it is what is seen. A delta or velocity is zero, or the nearest the range
-        allows. Frozen commands stay as they were, or as seen.
+        A target stays what was commanded last, if the robot is near it and has settled, so that an arm does not sink
+        under its weight and a gripper keeps its grip; else it is what is seen: an arm on its way comes after its
+        targets, and would go on to them. A delta or velocity is zero, or the nearest the range allows. Frozen commands
+        stay as they were, or as seen.
 
         Args:
             state: (B, S); numbers that are not usable are NaN.
             told: (B, A), what was commanded last.
+            settled: bool (B, A), whether what a target is of stands still; by default it does.
 
         Returns:
             NaN for targets of which nothing is known.
@@ -255,6 +259,8 @@ class Units(nn.Module):
         still = torch.where(self.action_varies, still, (self.action_low + self.action_high) / 2)
         kept = torch.where(told.isfinite(), told, seen).clamp(self.action_low, self.action_high)
         far = (told - seen).abs() > self.displacement_scale
+        if settled is not None:
+            far |= ~settled & seen.isfinite() & ~self.frozen
         pose = torch.where(told.isnan() | far, seen, told)
         return torch.where(
             self.is_target, pose, torch.where(self.frozen & kept.isfinite(), kept, still.expand_as(kept))
@@ -265,6 +271,10 @@ class Units(nn.Module):
         """Standing still, inside: (1, A)."""
         unknown = torch.full((1, len(self.state_mean)), torch.nan, device=self.device)
         return self.normalise_motions(torch.where(self.is_target, 0.0, self.hold(unknown)))
+
+    def moves(self, state: Tensor, before: Tensor) -> Tensor:
+        """Whether what each target is of moved from one state (B, S) to the next: bool (B, A)."""
+        return self.seen(((state - before).abs() > AT_REST * self.state_step).float()) > 0
 
     # -- states ---
 

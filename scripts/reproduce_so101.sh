@@ -27,7 +27,7 @@ act() { # what it learns from
 }
 
 filter() { # seed
-  local wm="$OUT/wm_$1" data="--dataset.repo_id=latentsafe/so101_mix_cache --dataset.root=$DATA/so101_cache"
+  local wm="$OUT/wm_$1" data="--dataset.repo_id=latentsafe/so101_cache --dataset.root=$DATA/so101_cache"
   [ -e "$wm/checkpoints/last" ] || timed "world_model_$1" $BIN/lerobot-train --config_path=configs/so101_rssm.yaml $data \
     --policy.frame_cache="$DATA/so101_cache" --output_dir="$wm" --seed="$1"
   [ -e "$OUT/filter_$1" ] || timed "reachability_$1" $BIN/latentsafe train-reachability \
@@ -39,8 +39,11 @@ record so101_careful so101_careful 2
 record so101_mix so101_mix 0
 act reckless
 act careful
-[ -e "$DATA/so101_cache" ] || timed cache $BIN/latentsafe cache --dataset.repo_id=latentsafe/so101_mix \
-  --dataset.root="$DATA/so101_mix" --output_dir="$DATA/so101_cache"
+[ -e "$DATA/so101" ] || $BIN/lerobot-edit-dataset --operation.type=merge --new_repo_id=latentsafe/so101 \
+  --new_root="$DATA/so101" --operation.repo_ids="[latentsafe/so101_mix, latentsafe/so101_careful, latentsafe/so101_reckless]" \
+  --operation.roots="[$DATA/so101_mix, $DATA/so101_careful, $DATA/so101_reckless]"
+[ -e "$DATA/so101_cache" ] || timed cache $BIN/latentsafe cache --dataset.repo_id=latentsafe/so101 \
+  --dataset.root="$DATA/so101" --output_dir="$DATA/so101_cache"
 for seed in $SEEDS; do
   filter "$seed"
 done

@@ -127,6 +127,17 @@ def test_holding_keeps_a_grip_and_carries_a_sagging_arm(arm):
     torch.testing.assert_close(arm.shield(seen(), None).action, told)
 
 
+def test_an_arm_on_its_way_stops_where_it_is_seen_and_then_does_not_sink(arm):
+    """It comes after its targets: to stay what it was told last would be to go on."""
+    ahead = torch.tensor([[2.5, 0.0, 0.0]])
+    for degrees in (0.0, 1.0):
+        arm.shield(seen(POSE + degrees), POSE + degrees + ahead)
+    stopped = POSE + 2.0
+    torch.testing.assert_close(arm.shield(seen(stopped), None).action, stopped)
+    for sag in (0.7, 1.2, 1.2):  # by its weight, and no further
+        torch.testing.assert_close(arm.shield(seen(stopped - sag), None).action, stopped)
+
+
 def test_an_arm_that_is_moved_away_by_hand_stays_where_it_is(arm):
     arm.shield(seen(), POSE)
     for degrees in (4.0, 8.0, 12.0):
