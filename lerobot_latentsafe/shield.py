@@ -222,6 +222,7 @@ class Shield:
             if fresh and torch.equal(other.decision.action.cpu(), action) and self._accepts(other):
                 self.belief, self.pose, self.missed = other.belief, other.pose, other.missed
                 self.told, self.executed = other.told, other.executed
+                self.moving, self.holding = other.moving, other.holding
                 self.decision, self.decided_at = other.decision, other.decided_at
                 self.recent, self.retreated = other.recent, other.retreated
                 return True
