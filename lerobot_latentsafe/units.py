@@ -18,7 +18,7 @@ RANGE_TOLERANCE = 0.1
 """Share of the data's range by which a command may leave it: it is clipped, and judged and executed as clipped."""
 STATE_TOLERANCE = 1.0
 """Share of the data's range by which a number of the state may leave it and still be believed."""
-STEP_TOLERANCE, MISSED_TICKS = 2.0, 3
+STEP_TOLERANCE, MISSED_TICKS = 2.0, 1
 """A number of the state that changes by more than so many of the data's largest steps since it was read last is not
 believed; if it could not be read meanwhile, so many ticks count at most."""
 AT_REST = 0.1
