@@ -17,6 +17,7 @@ from lerobot_latentsafe.datasets.clips import Clip
 from lerobot_latentsafe.encoders.pictures import to_model_images
 from lerobot_latentsafe.latent import Latent
 from lerobot_latentsafe.margin import FailureMargin, hinge_loss
+from lerobot_latentsafe.meanings import MeaningError
 from lerobot_latentsafe.reachability import look_ahead
 from lerobot_latentsafe.units import Units
 from lerobot_latentsafe.world_models.base import WorldModel
@@ -88,6 +89,7 @@ class SafetyModel(nn.Module):
         sizes = len(trained_on.state_mean), len(trained_on.action_low)
         self.world_model = config.world_model.build(trained_on.cameras, *sizes)
         config.change(world_model=self.world_model.config)
+        self._perhaps_targets = trained_on.perhaps_targets(config.fallback.frozen_commands)
         self.margin = self.new_margin()
         self.critic = self.new_critic()
         self.lacks_weights = trained_on.has_reached("world_model")
@@ -195,8 +197,18 @@ class SafetyModel(nn.Module):
         return self.config.trained_on.has_reached(self._stage_of_law)
 
     def require_trained_for_law(self) -> None:
-        """Raise unless training has come far enough for the law to decide."""
+        """Raise unless training has come far enough for the law to decide, and it is known how to stand still.
+
+        Raises:
+            MeaningError: a filter of a version before 0.3, to which joint targets were motions: its hold is a jump.
+        """
         self.require_stage(self._stage_of_law)
+        if self._perhaps_targets:
+            raise MeaningError(
+                f"this filter was trained by a version before 0.3 and may take {', '.join(self._perhaps_targets)} for "
+                "motions, though the state has numbers of these names. If they are targets, its hold would be a jump. "
+                "Train the world model and the critic again: training then tells what each command means"
+            )
 
     def require_stage(self, stage: str) -> None:
         """Raise unless training has come at least this far, and the critic says what the law reads.

@@ -87,6 +87,13 @@ class TrainedOn:
         given, states = self.meanings or {}, self.state_names or []
         return [parse(name, given.get(name, "delta"), states) for name in self.action_names or []]
 
+    def perhaps_targets(self, frozen_commands: list[str]) -> list[str]:
+        """Commands of filters of versions before 0.3 whose name the state has, too, so that they may be targets."""
+        if self.meanings is not None:
+            return []
+        varied = [name for name, varies in zip(self.action_names or [], self.action_varies or []) if varies]
+        return [name for name in varied if name in (self.state_names or []) and name not in frozen_commands]
+
     @property
     def ranges(self) -> dict[str, tuple[float, float]]:
         """Command -> least and largest value in the data; empty before training."""

@@ -80,7 +80,8 @@ def commands(env: str, output: Path) -> list[list[str]]:
         ["latentsafe", "wrap", f"--policy.path={output}/filter", f"--base_policy_path={output}/act/{trained}",
          f"--output_dir={output}/shielded"],
         ["lerobot-eval", f"--policy.path={output}/shielded", f"--env.type={env}", "--env.episode_length=40",
-         "--eval.n_episodes=2", "--eval.batch_size=2", "--eval.use_async_envs=false", "--policy.device=cpu", f"--output_dir={output}/eval"],
+         "--eval.n_episodes=2", "--eval.batch_size=2", "--eval.use_async_envs=false", "--policy.device=cpu",
+         f"--output_dir={output}/eval"],
     ]  # fmt: skip
 
 

@@ -7,6 +7,7 @@ import tiny
 import torch
 
 from lerobot_latentsafe.decision import Reason
+from lerobot_latentsafe.meanings import MeaningError
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.shield import UnknownPoseError
 
@@ -167,6 +168,14 @@ def test_without_a_usable_state_the_last_goal_stays(arm):
         torch.testing.assert_close(arm.shield(seen(nothing, t), POSE).action, told)
 
 
+def test_a_monitor_lets_all_pass_whatever_it_sees(arm):
+    arm.config.law.mode = "monitor"
+    for wanted in (POSE + 50, torch.full_like(POSE, math.nan), torch.zeros_like(POSE)):
+        decision = arm.shield(seen(torch.full_like(POSE, math.nan)), wanted)
+        torch.testing.assert_close(decision.action, wanted, equal_nan=True)
+        assert decision.unsafe.all() and not decision.intervened.any()
+
+
 def test_nothing_is_commanded_to_an_arm_that_nobody_has_seen(arm):
     with pytest.raises(UnknownPoseError, match="nobody knows where the robot is, so nothing is commanded"):
         arm.shield(seen(torch.full_like(POSE, math.nan)), POSE)
@@ -257,3 +266,12 @@ def test_rows_of_a_batch_are_judged_by_themselves(arm):
     wrong[STATE][0, 0] = math.nan
     decision = arm.shield(wrong, poses + 1)
     torch.testing.assert_close(decision.action, torch.cat([POSE, POSE + 11]))
+
+
+def test_a_filter_of_before_is_refused_where_its_hold_could_be_a_jump(tmp_path):
+    trained = tiny.save_arm_filter(tmp_path / "old", trained_on_meanings=None)
+    with pytest.raises(MeaningError, match=r"take lift.pos, elbow.pos, gripper.pos for motions.*Train the world model"):
+        LatentSafePolicy.from_pretrained(trained).decide(seen())
+    frozen = tiny.save_arm_filter(tmp_path / "frozen", trained_on_meanings=None, fallback_frozen_commands=tiny.ARM)
+    decision = LatentSafePolicy.from_pretrained(frozen).decide(seen())
+    torch.testing.assert_close(decision.action, POSE)

@@ -281,10 +281,10 @@ def test_bad_options_list_the_good_ones(changes, message):
         tiny.config(**changes)
 
 
-def test_dataset_without_proprioception_is_refused(dataset_meta):
+def test_dataset_without_actions_is_refused():
     config = tiny.config()
     config.output_features = {}
-    with pytest.raises(ValueError, match=r"needs observation.state"):
+    with pytest.raises(ValueError, match="needs an action feature"):
         config.validate_features()
 
 
