@@ -21,11 +21,14 @@ def main() -> None:
     parser.add_argument("--careful", required=True, help="policy that learnt to push to the mark")
     parser.add_argument("--filters", nargs="+", required=True)
     parser.add_argument("--n", type=int, default=100, help="starts")
+    parser.add_argument("--law.name", dest="law", help="by default the filter's own; `margin` stops where l is low")
     parser.add_argument("--law.epsilon", dest="epsilon", type=float, help="by default the filter's own")
     parser.add_argument("--output", type=Path, default=Path("results/so101/policies.json"))
     arguments = parser.parse_args()
     bases = {"reckless": arguments.reckless, "careful": arguments.careful}
-    table = compare_policies(bases, arguments.filters, arguments.n, LawOptions(epsilon=arguments.epsilon))
+    table = compare_policies(
+        bases, arguments.filters, arguments.n, LawOptions(name=arguments.law, epsilon=arguments.epsilon)
+    )
     first = {name: table["reckless"][name] for name in ("bare", "shielded")}
     write_json(arguments.output, {**first, **table, **provenance(seeds=[FIRST_SEED])})
 
