@@ -1,7 +1,7 @@
 #!/usr/bin/env python
 """Takes one of LeRobot's own simulated tasks through every step, small: it shows that all steps run, and no more.
 
-    pip install gym-pusht 'pymunk<7'     or: gym-aloha
+    pip install gym-pusht 'pymunk<7'     or: gym-aloha 'dm-control<1.0.38' 'mujoco<3.6'
     scripts/try_gym_task.py --env=pusht --output=outputs/pusht
 
 Records episodes of random motion (failing: the first number of the state is among its largest), trains a world model,

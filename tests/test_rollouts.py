@@ -1,4 +1,5 @@
 import math
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,15 @@ from lerobot_latentsafe import LatentSafeDubinsEnv
 from lerobot_latentsafe.decision import LawOptions, Reason
 from lerobot_latentsafe.dubins.car import step as car_step
 from lerobot_latentsafe.envs import dubins_env
-from lerobot_latentsafe.evaluation.rollouts import Choice, Episodes, check_environment, compare, run_episodes, steps
+from lerobot_latentsafe.evaluation.rollouts import (
+    Choice,
+    Episodes,
+    VectorWorld,
+    check_environment,
+    compare,
+    run_episodes,
+    steps,
+)
 from lerobot_latentsafe.experiments.dubins.figures import trajectories
 from lerobot_latentsafe.modeling_latentsafe import load_filter
 
@@ -46,6 +55,22 @@ class Countdown:
 
     def step(self, action):
         self.info = self.info - action
+
+
+def test_an_environment_that_tells_no_failure_is_refused_and_one_without_a_task_is_not(monkeypatch):
+    monkeypatch.setattr(dubins_env.DubinsEnv, "_info", lambda self, success: {"is_success": success})
+    with pytest.raises(ValueError, match=r"latentsafe_dubins tells no `failure` in its info.*it tells is_success"):
+        VectorWorld(car(), [0])
+    monkeypatch.undo()
+    known = dubins_env.DubinsEnv.reset
+
+    def nameless(self, **options):
+        del self.task_description, self.task
+        return known(self, **options)
+
+    monkeypatch.setattr(dubins_env.DubinsEnv, "reset", nameless)
+    with closing(VectorWorld(car(), [0, 1])) as world:
+        assert world.task == ["", ""]
 
 
 def test_the_loop_goes_on_until_all_episodes_have_ended():

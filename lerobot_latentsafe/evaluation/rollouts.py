@@ -5,7 +5,7 @@ something accumulates it from the steps: rates here, tables of a study in `exper
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple, Protocol
 
@@ -110,14 +110,30 @@ class PolicyActor:
 
 
 class VectorWorld:
-    """LeRobot's environments, one for each seed; `info` is a dict for each of them."""
+    """LeRobot's environments, one for each seed; `info` is a dict for each of them.
+
+    Raises:
+        ValueError: an environment that does not tell what failed.
+    """
 
     def __init__(self, env: EnvConfig, seeds: Sequence[int]):
         self.envs = next(iter(make_env(env, n_envs=len(seeds)).values()))[0]
-        self.task = list(self.envs.call("task_description"))
         self.over = np.zeros(len(seeds), bool)
         self._observation, info = self.envs.reset(seed=list(seeds))
         self.info = [_row(info, i) for i in range(len(seeds))]
+        if not all("failure" in row for row in self.info):
+            raise ValueError(
+                f"environment {env.type} tells no `failure` in its info, so nothing says what a filter prevents; it "
+                f"tells {', '.join(self.info[0]) or 'nothing'}. Run a wrapped policy in it with lerobot-eval"
+            )
+        self.task = self._tasks()
+
+    def _tasks(self) -> list[str]:
+        """Each environment's task in words, under the names that LeRobot looks for."""
+        for name in ("task_description", "task"):
+            with suppress(AttributeError, NotImplementedError):
+                return list(self.envs.call(name))
+        return [""] * self.envs.num_envs
 
     def observe(self) -> dict[str, Any]:
         """A LeRobot batch."""
