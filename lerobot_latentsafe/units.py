@@ -258,10 +258,14 @@ class Units(nn.Module):
         still = torch.zeros_like(self.action_low).clamp(self.action_low, self.action_high)
         still = torch.where(self.action_varies, still, (self.action_low + self.action_high) / 2)
         kept = torch.where(told.isfinite(), told, seen).clamp(self.action_low, self.action_high)
-        far = (told - seen).abs() > self.displacement_scale
+        leap, largest = seen - told, torch.maximum(-self.displacement_low, self.displacement_high)
+        far = leap.abs() > self.displacement_scale
         if settled is not None:
             far |= ~settled & seen.isfinite() & ~self.frozen
-        pose = torch.where(told.isnan() | far, seen, told)
+        # Whichever of the two is wrong, what is told or what is seen, the step is none that the data lack.
+        wide = (leap.abs() > largest) & (leap.abs() <= 2 * largest)
+        between = torch.where(wide, told + leap.clamp(-largest, largest), seen)
+        pose = torch.where(told.isnan() | far, between, told)
         return torch.where(
             self.is_target, pose, torch.where(self.frozen & kept.isfinite(), kept, still.expand_as(kept))
         )
