@@ -52,3 +52,6 @@ policies="$OUT/act_reckless/checkpoints/last/pretrained_model $OUT/act_careful/c
 $BIN/python scripts/so101_ranges.py --policies $policies --datasets "$DATA/so101_reckless" "$DATA/so101_careful"
 filters=$(for seed in $SEEDS; do echo "$OUT/filter_$seed"; done)
 $BIN/python scripts/so101_policies.py --reckless=${policies% *} --careful=${policies#* } --filters $filters
+$BIN/python scripts/so101_policies.py --reckless=${policies% *} --careful=${policies#* } --filters $filters \
+  --law.name=margin --law.epsilon=0 --output=results/so101/margin.json
+$BIN/python scripts/so101_faults.py --filter="$OUT/filter_0"
