@@ -3,6 +3,7 @@
 The shield, the evaluation, the task policy that learns in imagination and the LeRobot policy share it.
 """
 
+import warnings
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import Any
@@ -87,7 +88,9 @@ class SafetyModel(nn.Module):
         self.config = config
         self.units = Units(trained_on, config.fallback.frozen_commands)
         sizes = len(trained_on.state_mean), len(trained_on.action_low)
-        self.world_model = config.world_model.build(trained_on.cameras, *sizes)
+        with warnings.catch_warnings():  # without proprioception some layers have no inputs
+            warnings.filterwarnings("ignore", "Initializing zero-element tensors")
+            self.world_model = config.world_model.build(trained_on.cameras, *sizes)
         config.change(world_model=self.world_model.config)
         self._perhaps_targets = trained_on.perhaps_targets(config.fallback.frozen_commands)
         self.margin = self.new_margin()
