@@ -208,6 +208,7 @@ def test_cached_frames_without_proprioception_pass_lerobots_steps(tmp_path):
         assert steps(batch)["index"].tolist() == [0, 1, 2, 3]
 
 
+@pytest.mark.filterwarnings("ignore:Initializing zero-element tensors")
 @pytest.mark.parametrize("kind", ["rssm", "gru", "dino_wm"])
 def test_world_models_learn_without_proprioception(kind):
     config = getattr(tiny, f"{kind}_config")()
