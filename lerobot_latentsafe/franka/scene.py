@@ -25,7 +25,7 @@ from lerobot_latentsafe.franka.actions import (
     WORKSPACE_LOW,
     action_limits,
 )
-from lerobot_latentsafe.runtime.rendering import make_renderer
+from lerobot_latentsafe.runtime.rendering import Drawn
 
 ASSETS = Path(__file__).parent / "assets"
 CAMERAS = ("front", "wrist")
@@ -103,7 +103,7 @@ class SceneState:
     extra: dict[str, np.ndarray]
 
 
-class FrankaScene:
+class FrankaScene(Drawn):
     """A table-top scene around the arm. Subclasses add objects, their reset, and the privileged truth.
 
     Attributes:
@@ -123,7 +123,6 @@ class FrankaScene:
         self.kinematics = InverseKinematics()
         self.tool = self.model.site("tcp").id
         self.fingers = [self.model.joint(f"finger_{side}").qposadr[0] for side in ("left", "right")]
-        self._renderer: mujoco.Renderer | None = None
         self._before = np.empty(mujoco.mj_stateSize(self.model, PHYSICS))
         self.controller = self._home()
         self.seed = 0
@@ -220,23 +219,6 @@ class FrankaScene:
         turned = mink.SO3.from_matrix(rotation @ POINTING_DOWN.T).log()
         opening = np.clip(self.data.qpos[self.fingers].sum() / GRIPPER_WIDTH, 0, 1)
         return np.concatenate([self.data.qpos[:7], [opening], position, turned]).astype(np.float32)
-
-    def render(self, camera: str) -> np.ndarray:
-        """An image (size, size, 3) uint8.
-
-        Raises:
-            RuntimeError: there is no OpenGL library to draw with.
-        """
-        if self._renderer is None:
-            self._renderer = make_renderer(self.model, self.image_size)
-        self._renderer.update_scene(self.data, camera)
-        return self._renderer.render()
-
-    def close(self) -> None:
-        """Free the OpenGL context."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
 
     def exploded(self) -> bool:
         """Whether MuJoCo warned of bad numbers, or something moves faster than anything physical (30 m/s, rad/s)."""

@@ -3,6 +3,7 @@
 import os
 
 import mujoco
+import numpy as np
 
 
 def make_renderer(model: mujoco.MjModel, size: int) -> mujoco.Renderer:
@@ -22,3 +23,29 @@ def make_renderer(model: mujoco.MjModel, size: int) -> mujoco.Renderer:
             "libgl1-mesa-dri), or MUJOCO_GL=osmesa with libosmesa6; set it in the shell if another package imports "
             "MuJoCo first"
         ) from e
+
+
+class Drawn:
+    """A scene that can be drawn: it has `model`, `data` and `image_size`."""
+
+    model: mujoco.MjModel
+    data: mujoco.MjData
+    image_size: int
+    _renderer: mujoco.Renderer | None = None
+
+    def render(self, camera: str) -> np.ndarray:
+        """A picture (size, size, 3) uint8.
+
+        Raises:
+            RuntimeError: there is no OpenGL library to draw with.
+        """
+        if self._renderer is None:
+            self._renderer = make_renderer(self.model, self.image_size)
+        self._renderer.update_scene(self.data, camera)
+        return self._renderer.render()
+
+    def close(self) -> None:
+        """Free the OpenGL context."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None

@@ -9,7 +9,7 @@ edge, and no arm brings it back: a filter has to stop the push before.
 import mujoco
 import numpy as np
 
-from lerobot_latentsafe.runtime.rendering import make_renderer
+from lerobot_latentsafe.runtime.rendering import Drawn
 from lerobot_latentsafe.so101.actions import (
     EPISODE_SECONDS,
     FOREARM,
@@ -43,7 +43,7 @@ OPENING = np.radians([-5.0, 90.0])
 """Of the jaw at 0 and at 100, radians."""
 
 
-class PushScene:
+class PushScene(Drawn):
     """The arm, the cube and the mark.
 
     Attributes:
@@ -63,7 +63,6 @@ class PushScene:
         self.joints = [self.model.joint(joint).qposadr[0] for joint in JOINTS]
         self.cube = self.model.body("cube").id
         self.tip = self.model.site("tip").id
-        self._renderer: mujoco.Renderer | None = None
         self.targets = REST.copy()
         self.mark, self.seed = 0.0, 0
 
@@ -117,23 +116,6 @@ class PushScene:
             "severity": float(np.clip((cube[0] + HALF_CUBE - EDGE) / (2 * HALF_CUBE), 0, 1)),
             "state": np.array([*cube, self.mark, *self.tip_position(), *self.proprioception()], np.float32),
         }
-
-    def render(self, camera: str) -> np.ndarray:
-        """A picture (size, size, 3) uint8.
-
-        Raises:
-            RuntimeError: there is no OpenGL library to draw with.
-        """
-        if self._renderer is None:
-            self._renderer = make_renderer(self.model, self.image_size)
-        self._renderer.update_scene(self.data, camera)
-        return self._renderer.render()
-
-    def close(self) -> None:
-        """Free the OpenGL context."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
 
 
 def _radians(targets: np.ndarray) -> np.ndarray:
