@@ -130,6 +130,9 @@ class Units(nn.Module):
     frozen: Tensor
     stays: Tensor
     is_target: Tensor
+    motion_low: Tensor
+    motion_high: Tensor
+    loudest: Tensor
     _shown_by: Tensor
 
     def __init__(self, trained_on: TrainedOn, frozen_commands: list[str]):
@@ -149,6 +152,10 @@ class Units(nn.Module):
         commands = trained_on.commands
         self.register_buffer("action_varies", varies, persistent=False)
         self.register_buffer("is_target", torch.tensor([c.meaning == "target" for c in commands]), persistent=False)
+        scale, targets = self.displacement_scale, self.is_target  # what is -1 and 1 inside, and the most that is heard
+        self.register_buffer("motion_low", torch.where(targets, -scale, self.action_low), persistent=False)
+        self.register_buffer("motion_high", torch.where(targets, scale, self.action_high), persistent=False)
+        self.register_buffer("loudest", torch.where(targets, LOUDEST, 1.0), persistent=False)
         frozen = torch.tensor([c.name in frozen_commands or c.meaning == "other" for c in commands])
         self.register_buffer("frozen", frozen, persistent=False)
         self.register_buffer("stays", frozen & (trained_on.meanings is not None), persistent=False)
@@ -174,31 +181,22 @@ class Units(nn.Module):
         Args:
             state: (..., S) in robot units, at which the action was chosen; needed where commands are targets.
         """
-        low, high = self._motion_range
+        low, high = self.motion_low, self.motion_high
         return 2 * (action - self._origin(state) - low) / (high - low) - 1
 
     def denormalise_action(self, action: Tensor, state: Tensor | None = None) -> Tensor:
         """Motions -> robot units: (..., A); the inverse of `normalise_action`."""
-        low, high = self._motion_range
+        low, high = self.motion_low, self.motion_high
         return self._origin(state) + low + (action + 1) / 2 * (high - low)
 
     def heard_action(self, action: Tensor, state: Tensor | None = None) -> Tensor:
         """Robot units -> motions as the world model hears them: bounded (..., A)."""
-        motion, loudest = self.normalise_action(action, state), torch.where(self.is_target, LOUDEST, 1.0)
-        return motion.clamp(-loudest, loudest)
+        return self.normalise_action(action, state).clamp(-self.loudest, self.loudest)
 
     def normalise_motions(self, motion: Tensor) -> Tensor:
         """Motions in robot units, of targets displacements, -> about [-1, 1]: (..., A)."""
-        low, high = self._motion_range
+        low, high = self.motion_low, self.motion_high
         return 2 * (motion - low) / (high - low) - 1
-
-    @property
-    def _motion_range(self) -> tuple[Tensor, Tensor]:
-        """What is -1 and 1 inside, in robot units: (A,) each."""
-        if not self.has_targets:
-            return self.action_low, self.action_high
-        low = torch.where(self.is_target, -self.displacement_scale, self.action_low)
-        return low, torch.where(self.is_target, self.displacement_scale, self.action_high)
 
     def _origin(self, state: Tensor | None) -> Tensor | float:
         """What motions count from: the present state of targets, zero of other commands: (..., A)."""
