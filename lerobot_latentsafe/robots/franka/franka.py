@@ -141,9 +141,9 @@ class LatentSafeFranka(FrankaDevice, Robot):
         for name, camera in self.cameras.items():
             observation[name] = camera.async_read()
             expected = self.observation_features[name]
-            if observation[name].shape != expected:
+            if np.shape(observation[name]) != expected:
                 raise ValueError(
-                    f"camera {name!r} gives images of shape {observation[name].shape}, configured is {expected}; "
+                    f"camera {name!r} gives images of shape {np.shape(observation[name])}, configured is {expected}; "
                     "set its width and height to what it delivers"
                 )
         return observation

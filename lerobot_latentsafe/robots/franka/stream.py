@@ -47,8 +47,9 @@ class Stream(threading.Thread):
         """
         if self.error is not None:
             raise self.error
-        silent = time.monotonic() - self._sent
-        if not self.is_alive() or not silent <= self.watchdog:
+        sent = self._sent
+        silent = time.monotonic() - sent
+        if not self.is_alive() or not 0 <= silent <= self.watchdog:
             raise ArmFaultError(f"no pose was sent to the arm for {silent:.2f} s; its stream hangs or has ended")
 
     def target(self) -> Pose:
@@ -68,6 +69,7 @@ class Stream(threading.Thread):
         return Pose(p0 + share * (p1 - p0), Slerp([0, 1], Rotation.concatenate([r0, r1]))(share))
 
     def run(self) -> None:
+        """Until it is stopped, or something goes wrong."""
         try:
             while not self._stopping.wait(1 / STREAM_HZ):
                 self._watch()
@@ -100,7 +102,8 @@ class Stream(threading.Thread):
                 self._holds = True
 
     def _in_time(self) -> bool:
-        return time.monotonic() - self._since <= self.watchdog
+        since = self._since
+        return 0 <= time.monotonic() - since <= self.watchdog
 
     def stop(self) -> None:
         """End the thread, unless it hangs in a call."""
