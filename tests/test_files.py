@@ -21,6 +21,7 @@ from lerobot_latentsafe.runtime.files import (
     refuse_existing,
     replacing,
     replacing_folder,
+    scratch_folder,
 )
 
 
@@ -113,6 +114,17 @@ def test_what_a_killed_process_left_of_a_folder_is_cleared(tmp_path, ended):
     assert names(tmp_path) == ["out"] and (tmp_path / "out" / "a").read_text() == "new"
 
 
+def test_a_scratch_folder_goes_with_its_block_or_with_the_next_that_writes_the_same(tmp_path, ended):
+    (tmp_path / f".out.scratch.{ended}.partial").mkdir()
+    with replacing_folder(tmp_path / "out") as folder:
+        assert names(tmp_path) == []
+        with scratch_folder(tmp_path / "out") as scratch:
+            fill(scratch / "part")
+            (scratch / "part").rename(folder)
+        assert names(tmp_path) == [folder.name]
+    assert names(tmp_path) == ["out"]
+
+
 def test_a_folder_that_holds_something_is_left_alone(tmp_path):
     fill(tmp_path / "out", "precious")
     with pytest.raises(FileExistsError, match=r"out exists already; choose another --root"):  # noqa: SIM117
@@ -131,18 +143,23 @@ def test_all_of_a_folder_is_put_on_disk(tmp_path, monkeypatch):
 
 
 HOLDS = """
-import sys
-from lerobot_latentsafe.runtime.files import locked_folder
-with locked_folder(sys.argv[1]):
+import os, sys
+from pathlib import Path
+from filelock import FileLock
+with FileLock(sys.argv[1]):
+    Path(sys.argv[1]).write_text(str(os.getpid()))
     print("locked", flush=True)
     sys.stdin.read()
-"""
+"""  # as `locked_folder` does it, without a second's imports
 
 
 def test_two_at_once_are_told_apart_and_a_killed_one_holds_nothing(tmp_path):
     out = tmp_path / "out"
     other = subprocess.Popen(
-        [sys.executable, "-c", HOLDS, str(out)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", HOLDS, str(tmp_path / ".out.lock")],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
     )
     assert other.stdout.readline() == "locked\n"
     with pytest.raises(FolderInUseError, match=rf"process {other.pid} is writing {out} already"):  # noqa: SIM117

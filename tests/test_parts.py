@@ -127,9 +127,7 @@ def test_an_unfinished_recording_of_something_else_is_left_alone(tmp_path, monke
     with monkeypatch.context() as patch, pytest.raises(Killed):
         killed_at(patch, collection, "_record_part", 1)
         record(tmp_path / "cut")
-    with pytest.raises(
-        OtherRunError, match=r"cut\.parts holds a run with other options \(seed = 0\)"
-    ):
+    with pytest.raises(OtherRunError, match=r"cut\.parts holds a run with other options \(seed = 0\)"):
         record(tmp_path / "cut", options={**OPTIONS, "seed": 1})
     note = tmp_path / "cut.parts" / "options.json"
     note.write_text("")

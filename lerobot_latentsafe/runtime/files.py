@@ -91,6 +91,21 @@ def replacing_folder(path: str | Path, option: str = "--output_dir") -> Iterator
 
 
 @contextmanager
+def scratch_folder(path: str | Path) -> Iterator[Path]:
+    """An empty folder on the disk of `path` for what that is made of; gone when the block ends.
+
+    After a kill it goes when `path` is written again.
+    """
+    path = Path(path)
+    folder = _partial(path.with_name(f"{path.name}.scratch"))
+    folder.mkdir(parents=True)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
 def locked_folder(path: str | Path) -> Iterator[None]:
     """Keep other processes from an output folder, which need not be there yet. The lock ends with its process.
 
