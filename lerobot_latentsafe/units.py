@@ -11,6 +11,7 @@ from functools import cached_property
 import torch
 from torch import Tensor, nn
 
+from lerobot_latentsafe.looks import Look
 from lerobot_latentsafe.meanings import Command, parse
 
 STAGES = ("untrained", "world_model", "critic")
@@ -48,6 +49,9 @@ class TrainedOn:
             size is displacement_scale; 0, 0 and 1 for commands that are no targets.
         state_low, state_high, state_mean, state_std: of the data.
         state_step: by how much each number of the state changes from frame to frame at most.
+        action_step, action_jerk: largest change of each command from tick to tick, and largest change of that change.
+        unanswered: how far each command goes at most while the state stays as it is; see `looks.Response`.
+        looks: camera key -> what its pictures have in common.
     """
 
     stage: str = "untrained"
@@ -70,6 +74,10 @@ class TrainedOn:
     state_step: list[float] | None = None
     state_mean: list[float] | None = None
     state_std: list[float] | None = None
+    action_step: list[float] | None = None
+    action_jerk: list[float] | None = None
+    unanswered: list[float] | None = None
+    looks: dict[str, Look] | None = None
 
     def __post_init__(self) -> None:
         if self.stage not in STAGES:
