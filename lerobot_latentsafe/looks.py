@@ -146,11 +146,16 @@ class Response:
     Args:
         rest: (S,), by how much each number of the state may change and still count as unchanged, robot units.
         adds_up: bool (A,), commands of which each adds to those before: deltas and velocities; a target does not.
+        limit: (A,), how far each may go unanswered, robot units.
     """
 
-    def __init__(self, rest: Tensor, adds_up: Tensor):
-        self.rest, self.adds_up = rest, adds_up
+    def __init__(self, rest: Tensor, adds_up: Tensor, limit: Tensor | float = torch.inf):
+        self.rest, self.adds_up, self.limit = rest, adds_up, limit
         self.reset()
+
+    def is_missing(self, state: Tensor, sent: Tensor) -> Tensor:
+        """Which robots do not answer: bool (B,); see `unanswered`."""
+        return (self.unanswered(state, sent) > self.limit).any(-1)
 
     def reset(self) -> None:
         """Start an episode."""
