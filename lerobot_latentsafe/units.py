@@ -54,7 +54,6 @@ class TrainedOn:
             size is displacement_scale; 0, 0 and 1 for commands that are no targets.
         state_low, state_high, state_mean, state_std: of the data.
         state_step: by how much each number of the state changes from frame to frame at most.
-        action_step, action_jerk: largest change of each command from tick to tick, and largest change of that change.
         unanswered: how far each command goes at most while the state stays as it is; see `looks.Response`.
         looks: camera key -> what its pictures have in common.
     """
@@ -81,8 +80,6 @@ class TrainedOn:
     state_step: list[float] | None = None
     state_mean: list[float] | None = None
     state_std: list[float] | None = None
-    action_step: list[float] | None = None
-    action_jerk: list[float] | None = None
     unanswered: list[float] | None = None
     looks: dict[str, Look] | None = None
 

@@ -14,7 +14,7 @@ from lerobot_latentsafe.datasets.frame_cache import FrameCache
 from lerobot_latentsafe.looks import SIDE, Look, detail, learn_looks, shrink, thumbnails
 from lerobot_latentsafe.units import TrainedOn
 
-FRAMES = 8_000
+FRAMES = 6_000
 """Of each camera, at most: of whole episodes, as what repeats itself is learned, too. A minute's work if large."""
 Pieces = Callable[[int], Iterator[dict[str, Tensor]]]
 """Place of an episode -> its pictures piece by piece: camera key -> uint8 (n, C, H, W)."""
