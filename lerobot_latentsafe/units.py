@@ -144,6 +144,8 @@ class Units(nn.Module):
     frozen: Tensor
     stays: Tensor
     is_target: Tensor
+    adds_up: Tensor
+    unanswered: Tensor
     motion_low: Tensor
     motion_high: Tensor
     loudest: Tensor
@@ -155,6 +157,7 @@ class Units(nn.Module):
         n_actions, n_states = len(trained_on.action_low), len(trained_on.state_mean)
         unknown = {
             "action_step": [torch.inf] * n_actions, "action_jerk": [torch.inf] * n_actions,
+            "unanswered": [torch.inf] * n_actions,
             "displacement_low": [0.0] * n_actions, "displacement_high": [0.0] * n_actions,
             "displacement_scale": [1.0] * n_actions, "state_low": [-torch.inf] * n_states,
             "state_high": [torch.inf] * n_states, "state_step": [torch.inf] * n_states,
@@ -167,6 +170,8 @@ class Units(nn.Module):
         commands = trained_on.commands
         self.register_buffer("action_varies", varies, persistent=False)
         self.register_buffer("is_target", torch.tensor([c.meaning == "target" for c in commands]), persistent=False)
+        adds_up = torch.tensor([c.meaning in ("delta", "velocity") for c in commands])
+        self.register_buffer("adds_up", adds_up, persistent=False)
         scale, targets = self.displacement_scale, self.is_target  # what is -1 and 1 inside, and the most that is heard
         self.register_buffer("motion_low", torch.where(targets, -scale, self.action_low), persistent=False)
         self.register_buffer("motion_high", torch.where(targets, scale, self.action_high), persistent=False)
