@@ -118,7 +118,7 @@ class Guard:
         self.cameras = Cameras(model.world_model.image_keys, model.config.trained_on.looks)
         self.response = Response(AT_REST * units.state_step, units.adds_up, units.unanswered)
         self._begun = False
-        self._said: set[str] = set()
+        self._said: set[tuple[str, str]] = set()
         self.reset()
 
     def reset(self) -> None:
@@ -326,8 +326,8 @@ class Guard:
 
     def say_once(self, what: str, which: str = "") -> None:
         """Warn of something, once."""
-        if what not in self._said:
-            self._said.add(what)
+        if (what, which) not in self._said:
+            self._said.add((what, which))
             logger.warning("%s%s", what, which and f": {which}")
 
 

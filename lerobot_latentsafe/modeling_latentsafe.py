@@ -16,7 +16,7 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
-from lerobot_latentsafe._compat import NOT_AVERAGED, waits_for_actions
+from lerobot_latentsafe._compat import EVALUATION, NOT_AVERAGED, ROLLOUT, called_from
 from lerobot_latentsafe.base_policy import BasePolicy
 from lerobot_latentsafe.configuration_latentsafe import SEALED, LatentSafeConfig
 from lerobot_latentsafe.datasets.adoption import adopt_dataset, check_candidates
@@ -78,7 +78,6 @@ class LatentSafePolicy(PreTrainedPolicy):
         self._base: list[BasePolicy] = []  # in a list, so that its weights are not ours
         self._base_lost = False
         self._in_time = TimeLimit(self.model.device.type)
-        self._said_disarmed: str | None = None
         self.shield = Shield(self.model)
         if config.base_policy_path:
             self.attach(config.base_policy_path)
@@ -147,8 +146,9 @@ class LatentSafePolicy(PreTrainedPolicy):
 
     def reset(self) -> None:
         """Start an episode."""
-        if waits_for_actions():
+        if called_from(EVALUATION):  # a simulation waits for every action
             self.shield.clock = standing_still
+        self.shield.pace.strict |= called_from(ROLLOUT)
         self.shield.reset()
         if self.base:
             self._replan(None)
@@ -179,7 +179,6 @@ class LatentSafePolicy(PreTrainedPolicy):
             age_s: seconds since before the observation was taken.
         """
         self.model.require_trained_for_law()
-        self._say_if_disarmed()
         self.shield.offer()
         if self.base is None:
             return self._judge(batch, None, age_s, missing_reason=Reason.NO_BASE_POLICY)
@@ -225,14 +224,6 @@ class LatentSafePolicy(PreTrainedPolicy):
         except (Exception, SystemExit) as e:
             self._base_lost = True
             self.shield.note_failure("the base policy could not plan anew", e)
-
-    def _say_if_disarmed(self) -> None:
-        """Warn, once in a while of each setting, of a law that does not heed what is seen."""
-        disarmed = self.config.law.disarmed
-        if disarmed != self._said_disarmed:
-            self._said_disarmed = disarmed
-            if disarmed:
-                logger.warning("THIS FILTER PROTECTS NOTHING BY ITS VALUES: %s", disarmed)
 
     @torch.compiler.disable
     def _judge(self, *given: Any, **options: Any) -> FilterDecision:

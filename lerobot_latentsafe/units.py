@@ -5,6 +5,7 @@ A motion is a command that is zero, or as it was, where nothing moves: a delta, 
 its displacement, the target minus the present state. So targets are converted where the state is known: here.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -86,6 +87,8 @@ class TrainedOn:
     def __post_init__(self) -> None:
         if self.stage not in STAGES:
             raise ValueError(f"stage is {self.stage!r}; expected one of {', '.join(STAGES)}")
+        if self.fps is not None and not 0 < self.fps < math.inf:
+            raise ValueError(f"fps is {self.fps!r}; expected frames a second, more than 0")
         if self.fps is not None and self.fps == round(self.fps):
             self.fps = round(self.fps)  # 15, not 15.0, wherever people read it
 
