@@ -12,7 +12,8 @@ import pytest
 import tiny
 
 from lerobot_latentsafe.datasets import labels as label_files
-from lerobot_latentsafe.datasets.labels import METADATA, FailureLabels, LabelFileError, UnlabelledDatasetError
+from lerobot_latentsafe.datasets.label_file import METADATA
+from lerobot_latentsafe.datasets.labels import FailureLabels, LabelFileError, UnlabelledDatasetError
 from lerobot_latentsafe.labeling.store import ConflictError, LabelStore, first_failing
 
 
