@@ -13,8 +13,8 @@ from lerobot_latentsafe.datasets.labels import UNLABELLED
 from lerobot_latentsafe.evaluation.along_episodes import episode_margins
 from lerobot_latentsafe.labeling import automatic
 from lerobot_latentsafe.labeling.carrying import carry_labels, specifications_in
-from lerobot_latentsafe.labeling.disagreements import find_disagreements, in_words, write_disagreements
-from lerobot_latentsafe.labeling.store import LabelStore
+from lerobot_latentsafe.labeling.disagreements import find_disagreements, write_disagreements
+from lerobot_latentsafe.labeling.store import LabelStore, in_words
 from lerobot_latentsafe.labeling.suggestions import Suggester
 from lerobot_latentsafe.modeling_latentsafe import load_filter
 

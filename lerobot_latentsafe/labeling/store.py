@@ -340,3 +340,10 @@ def first_failing(failure: np.ndarray) -> int | None:
     first = int((failure == SAFE).sum())
     ordered = (failure[:first] == SAFE).all() and (failure[first:] == FAILING).all()
     return first if ordered else None
+
+
+def in_words(first: int | None, length: int) -> str:
+    """A verdict on an episode of so many frames."""
+    if first is None:
+        return "mixed labels"
+    return "never fails" if first == length else f"fails from frame {first}"
