@@ -124,13 +124,17 @@ class CheckLabels:
         """Write the page, and print the worst."""
         model, frames = load_filter(self.policy.path).model, self.dataset.frames()
         store = LabelStore(frames.root, frames.meta.repo_id, [self.specification])
-        margins = dict(episode_margins(model, frames))
+        margins, without = {}, {}
+        for episode, margin in episode_margins(model, frames):
+            (without if isinstance(margin, str) else margins)[episode] = margin
         found = find_disagreements(store, self.specification, margins)
         for d in found[:20]:
             label = in_words(store.verdict(self.specification, d.episode).first, len(d.margin))
             print(f"episode {d.episode:5d}  {d.degree:.2f}  labelled: {label}")
         write_disagreements(self.output, found, store, frames, self.specification)
-        print(f"{len(found)} disagreements; open {self.output}")
+        for episode, why in [*without.items()][:SHOWN]:
+            print(f"episode {episode} was not judged, because {why}")
+        print(f"{len(found)} disagreements; {len(without)} episodes were not judged; open {self.output}")
 
 
 @dataclass
