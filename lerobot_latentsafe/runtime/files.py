@@ -128,6 +128,9 @@ def locked_folder(path: str | Path) -> Iterator[None]:
         _clear_partial(path)
         yield
     finally:
+        if lock.lock_counter == 1:
+            with suppress(OSError):  # Windows removes no open file
+                os.unlink(lock.lock_file)
         lock.release()
 
 
