@@ -6,7 +6,7 @@ A `Contract` is what remains when that is settled; a dataset that has none is re
 
 import functools
 import logging
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -89,6 +89,11 @@ class Contract:
             meta.repo_id, Path(meta.root), meta.info.robot_type, meta.fps, state_names, action_names, cameras, left_out,
             episode, state, action, apart,
         )  # fmt: skip
+
+    def only(self, episodes: list[int] | None) -> "Contract":
+        """The same of these episodes alone; None: all."""
+        kept = np.isin(self.episode, self.episode if episodes is None else episodes)
+        return replace(self, episode=self.episode[kept], state=self.state[kept], action=self.action[kept])
 
     @property
     def statistics(self) -> dict[str, dict[str, np.ndarray]]:
