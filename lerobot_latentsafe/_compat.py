@@ -7,7 +7,6 @@ from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
 import pyarrow.parquet as pq
 from lerobot.utils.constants import ACTION
 from lerobot.utils.import_utils import require_package
@@ -16,7 +15,7 @@ from torch import Tensor
 if TYPE_CHECKING:
     from lerobot.configs.policies import PreTrainedConfig
     from lerobot.configs.train import TrainPipelineConfig
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from lerobot.datasets.dataset_writer import DatasetWriter
     from lerobot.policies.pretrained import PreTrainedPolicy
 
 RECORDING = re.compile(r"Recording episode (\d+)$")
@@ -60,9 +59,37 @@ def drop_episode_statistics(root: Path, features: list[str]) -> None:
         pq.write_table(table.drop_columns([c for c in table.column_names if c.startswith(left_over)]), file)
 
 
-def last_added(dataset: "LeRobotDataset", feature: str) -> np.ndarray:
-    """What a dataset that is being recorded holds of the frame that was added last."""
-    return dataset.writer.episode_buffer[feature][-1]
+WRITER = "lerobot.datasets.lerobot_dataset.DatasetWriter"
+"""The class by which a dataset that is being recorded writes."""
+
+
+def episode_to_write(writer: "DatasetWriter") -> dict:
+    """The episode that is being recorded: feature -> its frames, `episode_index`, and `size`, which counts frames."""
+    if writer.episode_buffer is None:
+        writer.episode_buffer = writer._create_episode_buffer()
+    return writer.episode_buffer
+
+
+def write_into(writer: "DatasetWriter", folder: Path) -> None:
+    """Have a dataset's writer write into another folder than its dataset's, pictures and metadata included."""
+    writer._root = writer._meta.root = folder
+
+
+def close_files(writer: "DatasetWriter") -> None:
+    """Make the episode that was just saved readable; the next one begins files of its own, as if recording went on.
+
+    LeRobot keeps its tables open, and its metadata in memory, until the last episode.
+    """
+    meta = writer._meta
+    writer.close_writer()
+    meta._close_writer()
+    meta.episodes = [{name: value for name, (value,) in meta.latest_episode.items()}]
+    meta.latest_episode = writer._latest_episode = None
+
+
+def read_anew(writer: "DatasetWriter") -> None:
+    """Have a dataset that was recorded read its metadata from its folder."""
+    writer._meta.episodes = None
 
 
 def is_lerobots(policy: "PreTrainedPolicy") -> bool:

@@ -46,7 +46,7 @@ class LatentSafeShieldedConfig(RobotConfig):
             person's resets), and commands of which the filter knows nothing, such as joint moves. Otherwise the first
             are filtered like any other, and at the others the robot holds still. Where commands are joint targets,
             what moves the robot between episodes passes anyway, but no joint goes further at once than in the data.
-        journal: a parquet file for every decision of a recording; `latentsafe record` sets it.
+        journal: a parquet file for every decision, for LeRobot's own loops. `latentsafe record` writes one of its own.
     """
 
     inner: InnerRobotConfig | None = None

@@ -51,7 +51,7 @@ class LatentSafeShielded(Robot):
 
     _phase: int | str | None
     _decided_at: float | None
-    _untaken: dict[str, float] | None
+    _untaken: tuple[dict[str, float], FilterDecision | None] | None
 
     def __init__(self, config: LatentSafeShieldedConfig):
         super().__init__(config)
@@ -142,7 +142,8 @@ class LatentSafeShielded(Robot):
             filtered = "does not filter now" if self._between and self.config.unfiltered_moves else "starts anew"
             logger.info("%s: the filter %s", announced if self._between else f"episode {announced}", filtered)
             if self.journal:
-                self.journal.hear(announced)
+                self.journal.write()
+                self.journal.begin(announced if isinstance(announced, int) else None)
         self._observation = self.inner.get_observation()
         self._seen_at = time.perf_counter()
         self._fresh = True
@@ -157,32 +158,21 @@ class LatentSafeShielded(Robot):
         return {f"shield.{name}": float(getattr(decision, name).item()) for name in ("value", "margin", "intervened")}
 
     def send_action(self, action: dict[str, float]) -> dict[str, float]:
-        """Filter an action and have the inner robot execute the result.
-
-        Returns:
-            What was executed.
-
-        Raises:
-            ValueError: while it records, a command that is not the robot's; nothing was sent.
-        """
-        if self.journal and not self._between and set(action) != set(self.action_features):
-            raise ValueError(
-                f"the operator commands {', '.join(action)}; {self.name} takes {', '.join(self.action_features)}. "
-                "Nothing was sent; use a teleoperator of this robot"
-            )
+        """Filter an action and have the inner robot execute the result; returns what was executed."""
         shield, names = self.filter.shield, self._trained_on.action_names
         before = shield.decision
         sent = self.inner.send_action(self._decide(action))
         self._sent.update(sent)
-        self._untaken = dict(sent)
-        if self.journal and shield.decision is not None and shield.decision is not before:
-            self.journal.add(shield.decision, [float(sent[name]) for name in names])
+        decision = shield.decision if shield.decision is not before else None
+        self._untaken = dict(sent), decision
+        if self.journal and decision is not None:
+            self.journal.add(decision, [float(sent[name]) for name in names])
         if set(sent) == set(names) and shield.executed is not None:  # the robot may have clipped it
             shield.was_executed(torch.tensor([[float(sent[name]) for name in names]], device=self.filter.model.device))
         return sent
 
-    def take_sent(self) -> dict[str, float] | None:
-        """What was executed since this was asked last, if anything: for whoever stores it."""
+    def take_sent(self) -> tuple[dict[str, float], FilterDecision | None] | None:
+        """What was executed since this was asked last, with the decision on it, if any: for whoever stores it."""
         sent, self._untaken = self._untaken, None
         return sent
 
@@ -237,7 +227,7 @@ class LatentSafeShielded(Robot):
         """The action of a decision on an action."""
         if not decision.intervened.item() and torch.equal(decision.action, decision.proposed):
             return action
-        if isinstance(self._phase, int) and self.journal is None:
+        if isinstance(self._phase, int) and self._untaken is not None:  # nobody asked what was sent
             self._say_once(
                 "LeRobot stores what was proposed, not what is executed now; `latentsafe record` stores that"
             )
