@@ -25,6 +25,9 @@ RESETTING = "Reset the environment"
 RETURNING = "Returning robot to initial position"
 """What they log before they move the robot back."""
 
+EVALUATION = "lerobot.scripts.lerobot_eval"
+"""The module of LeRobot's evaluation, whose `rollout` begins each episode by `policy.reset()`."""
+
 ADAPTER = "adapter_config.json"
 """The file beside a policy's config.json that makes it a PEFT adapter."""
 
@@ -46,6 +49,16 @@ def training_run() -> "TrainPipelineConfig | None":
                 return options
         frame = frame.f_back
     return None
+
+
+def waits_for_actions() -> bool:
+    """Whether LeRobot's evaluation in simulation is at work just now: it waits for every action, nothing is late."""
+    frame = sys._getframe(1)
+    while frame is not None:
+        if frame.f_globals.get("__name__") == EVALUATION and frame.f_code.co_name == "rollout":
+            return True
+        frame = frame.f_back
+    return False
 
 
 def drop_episode_statistics(root: Path, features: list[str]) -> None:

@@ -16,12 +16,13 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
-from lerobot_latentsafe._compat import NOT_AVERAGED
+from lerobot_latentsafe._compat import NOT_AVERAGED, waits_for_actions
 from lerobot_latentsafe.base_policy import BasePolicy
 from lerobot_latentsafe.configuration_latentsafe import SEALED, LatentSafeConfig
 from lerobot_latentsafe.datasets.adoption import adopt_dataset, check_candidates
 from lerobot_latentsafe.datasets.clips import FilterData
 from lerobot_latentsafe.decision import FilterDecision, LawOptions, Reason
+from lerobot_latentsafe.guard import standing_still
 from lerobot_latentsafe.model_card import make_model_card
 from lerobot_latentsafe.runtime.checkpoint import (
     CheckpointError,
@@ -32,6 +33,7 @@ from lerobot_latentsafe.runtime.checkpoint import (
     seal,
 )
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
+from lerobot_latentsafe.runtime.time_limit import TimeLimit
 from lerobot_latentsafe.safety_model import SafetyModel, UntrainedFilterError
 from lerobot_latentsafe.shield import Shield
 
@@ -73,6 +75,9 @@ class LatentSafePolicy(PreTrainedPolicy):
         setattr(self, NOT_AVERAGED, self._never_averaged())
         self._told_untrained = False
         self._base: list[BasePolicy] = []  # in a list, so that its weights are not ours
+        self._base_lost = False
+        self._in_time = TimeLimit(self.model.device.type)
+        self._said_disarmed: str | None = None
         self.shield = Shield(self.model)
         if config.base_policy_path:
             self.attach(config.base_policy_path)
@@ -141,9 +146,11 @@ class LatentSafePolicy(PreTrainedPolicy):
 
     def reset(self) -> None:
         """Start an episode."""
+        if waits_for_actions():
+            self.shield.clock = standing_still
         self.shield.reset()
         if self.base:
-            self.base.reset()
+            self._replan(None)
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
@@ -165,21 +172,66 @@ class LatentSafePolicy(PreTrainedPolicy):
 
     @torch.no_grad()
     def decide(self, batch: dict[str, Tensor], age_s: float = 0.0) -> FilterDecision:
-        """Like `select_action`, with the whole decision."""
+        """Like `select_action`, with the whole decision.
+
+        Args:
+            age_s: seconds since before the observation was taken.
+        """
         self.model.require_trained_for_law()
+        self._say_if_disarmed()
+        self.shield.offer()
         if self.base is None:
             return self._judge(batch, None, age_s, missing_reason=Reason.NO_BASE_POLICY)
-        try:
-            proposed = self.base.propose(batch)
-        except Exception:
-            if self.config.law.mode == "monitor":
-                raise
-            logger.exception("base policy failed; the fallback acts")
-            proposed = None
-        decision = self._judge(batch, proposed, age_s)
-        if decision.intervened.any():
-            self.base.replan(decision.action)
+        began = self.shield.clock()
+        proposed, wrong = self._ask_base(batch, age_s)
+        decision = self._judge(batch, proposed, age_s + self.shield.clock() - began, missing_reason=wrong)
+        # A policy that is only late keeps its plan where the robots stayed meanwhile.
+        stayed = wrong == Reason.DEADLINE_MISSED and self.shield.guard.holding.all()
+        if decision.intervened.any() and not stayed:
+            self._replan(decision.action)
         return decision
+
+    def _ask_base(self, batch: dict[str, Tensor], age_s: float) -> tuple[Tensor | None, Reason]:
+        """What the base policy proposes; None, and why, if it gives nothing in time."""
+        if self._base_lost:
+            self._replan(None)
+        if self._base_lost:
+            return None, Reason.BASE_POLICY_FAILED
+        # It gets an observation of its own: what it does to it must not change what is judged.
+        own = {key: value.clone() if isinstance(value, Tensor) else value for key, value in batch.items()}
+        try:
+            if self.shield.clock is standing_still:
+                return self.base.propose(own), Reason.BASE_POLICY_FAILED
+            left_s = self.shield.time_left(age_s, _rows(batch))
+            return self._in_time(lambda: self.base.propose(own), left_s), Reason.BASE_POLICY_FAILED
+        except TimeoutError as e:
+            self.shield.note_failure("the base policy was late", e)
+            return None, Reason.DEADLINE_MISSED
+        except (Exception, SystemExit) as e:
+            if self.config.law.mode == "monitor":  # there is nothing else to do than what the policy wants
+                raise
+            self.shield.note_failure("the base policy failed", e)
+            return None, Reason.BASE_POLICY_FAILED
+
+    def _replan(self, executed: Tensor | None) -> None:
+        """Have the base policy plan anew after an override (B, A), or begin; one that cannot is asked nothing."""
+        if self._in_time.busy:  # it is still at work on what is past
+            self._base_lost = True
+            return
+        try:
+            self.base.reset() if executed is None else self.base.replan(executed)
+            self._base_lost = False
+        except (Exception, SystemExit) as e:
+            self._base_lost = True
+            self.shield.note_failure("the base policy could not plan anew", e)
+
+    def _say_if_disarmed(self) -> None:
+        """Warn, once in a while of each setting, of a law that does not heed what is seen."""
+        disarmed = self.config.law.disarmed
+        if disarmed != self._said_disarmed:
+            self._said_disarmed = disarmed
+            if disarmed:
+                logger.warning("THIS FILTER PROTECTS NOTHING BY ITS VALUES: %s", disarmed)
 
     @torch.compiler.disable
     def _judge(self, *given: Any, **options: Any) -> FilterDecision:
@@ -241,6 +293,11 @@ class LatentSafePolicy(PreTrainedPolicy):
                             tags: list[str] | None, cfg=None, dataset_meta=None) -> ModelCard:  # fmt: skip
         """A card that says what the filter was trained on, how epsilon was set, and what it is not."""
         return make_model_card(self.config, dataset_repo_id, license, tags)
+
+
+def _rows(batch: dict[str, Tensor]) -> int:
+    """For how many robots an observation is."""
+    return max((len(v) for v in batch.values() if isinstance(v, Tensor) and v.dim() > 1), default=1)
 
 
 def load_filter(

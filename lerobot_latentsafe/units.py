@@ -5,6 +5,7 @@ A motion is a command that is zero, or as it was, where nothing moves: a delta, 
 its displacement, the target minus the present state. So targets are converted where the state is known: here.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,11 +14,13 @@ from torch import Tensor, nn
 
 from lerobot_latentsafe.meanings import Command, parse
 
-STAGES = ("untrained", "world_model", "critic")
+STAGES = ("untrained", "guard", "world_model", "critic")
 RANGE_TOLERANCE = 0.1
 """Share of the data's range by which a command may leave it: it is clipped, and judged and executed as clipped."""
 STATE_TOLERANCE = 1.0
 """Share of the data's range by which a number of the state may leave it and still be believed."""
+LEAP_TOLERANCE = 0.5
+"""Share of the data's largest change of a command from tick to tick by which a change may be larger."""
 STEP_TOLERANCE, MISSED_TICKS = 2.0, 1
 """A number of the state that changes by more than so many of the data's largest steps since it was read last is not
 believed; if it could not be read meanwhile, so many ticks count at most."""
@@ -32,7 +35,7 @@ class TrainedOn:
     """What the weights were trained on, and how far; filled in by the training commands, in robot units.
 
     Attributes:
-        stage: how far training has come: untrained, world_model, critic.
+        stage: how far training has come: untrained, guard (ranges alone), world_model, critic.
         target: what the critic was trained for: `reachability` (Eq. 5) or `risk` (SQRL).
         task: what the world model was trained to imagine, in words, where a policy of the same task must share it.
         cameras: the image features the filter reads, by default all of the dataset's.
@@ -44,6 +47,8 @@ class TrainedOn:
         action_low, action_high: least and largest command of the data.
         action_varies: False for commands that the data never vary; the filter keeps those and knows nothing else of
             them.
+        action_step, action_jerk: by how much each command changes from tick to tick at most, and by how much that
+            change does. Filters of versions before 0.4 do not know.
         displacement_low, displacement_high: least and largest displacement of each target, its 99th percentile in
             size is displacement_scale; 0, 0 and 1 for commands that are no targets.
         state_low, state_high, state_mean, state_std: of the data.
@@ -62,6 +67,8 @@ class TrainedOn:
     action_low: list[float] | None = None
     action_high: list[float] | None = None
     action_varies: list[bool] | None = None
+    action_step: list[float] | None = None
+    action_jerk: list[float] | None = None
     displacement_low: list[float] | None = None
     displacement_high: list[float] | None = None
     displacement_scale: list[float] | None = None
@@ -119,6 +126,8 @@ class Units(nn.Module):
     action_low: Tensor
     action_high: Tensor
     action_varies: Tensor
+    action_step: Tensor
+    action_jerk: Tensor
     displacement_low: Tensor
     displacement_high: Tensor
     displacement_scale: Tensor
@@ -140,6 +149,7 @@ class Units(nn.Module):
         self.action_names, self.state_names = trained_on.action_names or [], trained_on.state_names or []
         n_actions, n_states = len(trained_on.action_low), len(trained_on.state_mean)
         unknown = {
+            "action_step": [torch.inf] * n_actions, "action_jerk": [torch.inf] * n_actions,
             "displacement_low": [0.0] * n_actions, "displacement_high": [0.0] * n_actions,
             "displacement_scale": [1.0] * n_actions, "state_low": [-torch.inf] * n_states,
             "state_high": [torch.inf] * n_states, "state_step": [torch.inf] * n_states,
@@ -234,6 +244,19 @@ class Units(nn.Module):
             low = torch.where(self.is_target, torch.maximum(torch.minimum(low, pose), nearest), low)
             high = torch.where(self.is_target, torch.minimum(torch.maximum(high, pose), furthest), high)
         return torch.minimum(torch.maximum(action, low), high), far.any(-1)
+
+    def leaps(self, action: Tensor, before: Sequence[Tensor]) -> Tensor:
+        """Whether commands (B, A) change faster than the data show, or change how they change: bool (B,).
+
+        Args:
+            before: the last actions, at most two, the latest last.
+        """
+        far = torch.zeros_like(action, dtype=torch.bool)
+        if len(before):
+            far |= (action - before[-1]).abs() > (1 + LEAP_TOLERANCE) * self.action_step
+        if len(before) > 1:
+            far |= (action - 2 * before[-1] + before[-2]).abs() > (1 + LEAP_TOLERANCE) * self.action_jerk
+        return far.any(-1)
 
     def hold(self, state: Tensor, told: Tensor | None = None, settled: Tensor | None = None) -> Tensor:
         """What to do when nothing can be known: stay (B, A), in robot units.

@@ -38,6 +38,15 @@ def seeded():
     torch.manual_seed(0)
 
 
+@pytest.fixture(autouse=True)
+def no_hurry(monkeypatch, request):
+    """Filters decide as in a simulation that waits for them, unless a test brings a clock: no machine is too slow."""
+    from lerobot_latentsafe.guard import standing_still
+    from lerobot_latentsafe.shield import Shield
+
+    monkeypatch.setattr(Shield.__init__, "__defaults__", (standing_still,))
+
+
 class VirtualTime:
     """Time that passes while the test's thread sleeps, at once, and not while it computes: no machine is too slow."""
 

@@ -9,9 +9,9 @@ import torch
 
 from lerobot_latentsafe.decision import Reason
 from lerobot_latentsafe.evaluation.faults import BROKEN, FAULTS
+from lerobot_latentsafe.guard import UnknownPoseError
 from lerobot_latentsafe.meanings import MeaningError
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
-from lerobot_latentsafe.shield import UnknownPoseError
 
 PICTURE, STATE = "observation.images.front", "observation.state"
 POSE = torch.tensor([tiny.ARM_POSE])

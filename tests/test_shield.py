@@ -1,4 +1,5 @@
 import math
+import re
 from dataclasses import replace
 
 import pytest
@@ -231,9 +232,10 @@ def test_float_error_is_not_out_of_range(permissive):
 
 
 @pytest.mark.parametrize("shape", [(3, 1), (3, 7), (2, 2), (3,)])
-def test_action_of_another_shape_names_both(permissive, shape):
-    with pytest.raises(ValueError, match=r"shape \(.*expected \(3, 2\).*turn_rate.vel, speed.vel"):
-        permissive.shield(along(1)[0], torch.zeros(shape))
+def test_action_of_another_shape_is_no_action_and_the_log_names_both(permissive, shape, caplog):
+    decision = permissive.shield(along(1)[0], torch.zeros(shape))
+    assert decision.reason.eq(Reason.BASE_POLICY_FAILED).all() and decision.intervened.all()
+    assert re.search(r"shape \(.*expected a tensor of shape \(3, 2\).*turn_rate.vel, speed.vel", caplog.text)
 
 
 def test_no_action_at_all_falls_back(permissive):

@@ -16,11 +16,12 @@ import numpy as np
 from lerobot.utils.constants import ACTION
 
 from lerobot_latentsafe._compat import WRITER, episode_to_write
-from lerobot_latentsafe.collection.whole_episodes import WORK, WholeEpisodes, alone, recover
+from lerobot_latentsafe.collection.whole_episodes import WORK, WholeEpisodes, recover
 from lerobot_latentsafe.datasets.decisions import FILE, Journal, matching_rows
 from lerobot_latentsafe.datasets.labels import read_frames
 from lerobot_latentsafe.datasets.layout import INFO, check_layout
 from lerobot_latentsafe.decision import FilterDecision
+from lerobot_latentsafe.runtime.files import locked_folder
 
 logger = logging.getLogger(__name__)
 
@@ -92,9 +93,9 @@ def storing_what_was_sent(root: Path, resume: bool, take_sent: Callable[[], Sent
     Raises:
         FileExistsError: `root` exists, and no recording goes on.
         ValueError: the recording in `root` cannot go on; nothing was changed.
-        OSError: another process records into it.
+        FolderInUseError: another process records into it.
     """
-    with alone(root):
+    with locked_folder(root):
         if resume:
             _continue(root)
         elif root.exists():

@@ -5,23 +5,17 @@ in a folder of its own, and joins the dataset when it is complete, with files of
 is completed at the next start: an episode that was saved joins, one that was not is gone.
 """
 
-import logging
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
-from filelock import FileLock, Timeout
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.dataset_writer import DatasetWriter
 
 from lerobot_latentsafe._compat import close_files, read_anew, write_into
 from lerobot_latentsafe.datasets.layout import INFO
 from lerobot_latentsafe.runtime.files import replacing_folder
-
-logger = logging.getLogger(__name__)
 
 WORK = ".recording"
 """The folder, in a dataset's, for the episode that is being recorded."""
@@ -44,6 +38,7 @@ class WholeEpisodes(DatasetWriter):
         super().save_episode(episode_data, parallel_encoding)
         close_files(self)
         with replacing_folder(self.dataset / COMPLETE) as folder:
+            folder.mkdir()
             for part in ("data", "meta", "videos"):
                 if (self.begun / part).exists():
                     os.rename(self.begun / part, folder / part)
@@ -76,22 +71,3 @@ def recover(root: Path) -> None:
     if (root / COMPLETE).exists():
         complete(root)
     shutil.rmtree(root / WORK, ignore_errors=True)
-
-
-@contextmanager
-def alone(root: Path) -> Iterator[None]:
-    """Keep other recordings out of a dataset's folder, which need not exist.
-
-    Raises:
-        OSError: another process records into it.
-    """
-    root.parent.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(root.with_name(f".{root.name}.lock"))
-    try:
-        lock.acquire(timeout=0)
-    except Timeout:
-        raise OSError(f"another process records into {root}; end it, or choose another --dataset.root") from None
-    try:
-        yield
-    finally:
-        lock.release()

@@ -1,8 +1,6 @@
 """Labels and decisions as data: columns of a copy of the dataset, for those who have only LeRobot."""
 
-import os
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 from lerobot.datasets.dataset_tools import delete_episodes, modify_features, remove_feature
@@ -11,7 +9,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot_latentsafe.datasets.decisions import FILE, decision_columns
 from lerobot_latentsafe.datasets.label_places import LabelFileError, specifications_of
 from lerobot_latentsafe.datasets.labels import Content, Sidecar, read_frames
-from lerobot_latentsafe.runtime.files import refuse_existing, replacing_folder
+from lerobot_latentsafe.runtime.files import refuse_existing, replacing_folder, scratch_folder
 from lerobot_latentsafe.runtime.hub import HUB_FAILURES, HubUnreachableError
 
 COLUMN = {"dtype": "int64", "shape": (1,), "names": None}
@@ -74,14 +72,12 @@ def _with_columns(
     It is there whole or not at all, whenever the process is killed.
     """
     replaced = [name for name in columns if name in dataset.meta.features]
-    with replacing_folder(output_dir) as folder, TemporaryDirectory(dir=folder) as steps:
+    with replacing_folder(output_dir) as folder, scratch_folder(output_dir) as steps:
         if left_out:
-            dataset = delete_episodes(dataset, left_out, output_dir=Path(steps) / "part", repo_id=repo_id)
+            dataset = delete_episodes(dataset, left_out, output_dir=steps / "part", repo_id=repo_id)
         if replaced:  # LeRobot refuses to add what it removes in the same pass
-            dataset = remove_feature(dataset, replaced, output_dir=Path(steps) / "bare", repo_id=repo_id)
-        modify_features(dataset, columns, output_dir=Path(steps) / "whole", repo_id=repo_id)
-        for part in (Path(steps) / "whole").iterdir():
-            os.rename(part, folder / part.name)
+            dataset = remove_feature(dataset, replaced, output_dir=steps / "bare", repo_id=repo_id)
+        modify_features(dataset, columns, output_dir=folder, repo_id=repo_id)
     return LeRobotDataset(repo_id, root=output_dir)
 
 

@@ -178,7 +178,7 @@ class LatentSafeShielded(Robot):
 
     def _decide(self, action: dict[str, float]) -> dict[str, float]:
         """What is to be executed instead of an action, or that action itself."""
-        names, shield, period = self._trained_on.action_names, self.filter.shield, 1.0 / self._trained_on.fps
+        names, shield = self._trained_on.action_names, self.filter.shield
         known = set(action) == set(names)
         passes = self.config.unfiltered_moves and (self._between or not known)
         if (passes or (self._between and self._goes_to_places(action))) and all(map(math.isfinite, action.values())):
@@ -192,12 +192,13 @@ class LatentSafeShielded(Robot):
         now = time.perf_counter()
         rate = self._check_rate(now)
         proposed, age = torch.tensor([[float(action[name]) for name in names]]), self._age(now)
-        if rate == Reason.PASSED and age <= period and shield.adopt(proposed, period):
-            self._say_once("these actions come from a policy under this very filter; they are not filtered again")
+        batch = prepare_observation_for_inference(self._frame(), self.filter.model.device)
+        decision = shield.adopt(batch, proposed, age) if rate == Reason.PASSED else None
+        if decision is None:
+            decision = shield(batch, proposed, age, fault=rate)
         else:
-            batch = prepare_observation_for_inference(self._frame(), self.filter.model.device)
-            shield(batch, proposed, age, fault=rate)
-        return self._carry_out(shield.decision, action)
+            self._say_once("these actions come from a policy under this very filter; they are not filtered again")
+        return self._carry_out(decision, action)
 
     @property
     def _between(self) -> bool:
