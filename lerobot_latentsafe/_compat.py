@@ -1,11 +1,10 @@
 """Every place that leans on the insides of LeRobot 0.6: look here first when a new version breaks something."""
 
 import logging
-import re
 import sys
 from collections import deque
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import pyarrow.parquet as pq
 from lerobot.utils.constants import ACTION
@@ -18,12 +17,17 @@ if TYPE_CHECKING:
     from lerobot.datasets.dataset_writer import DatasetWriter
     from lerobot.policies.pretrained import PreTrainedPolicy
 
-RECORDING = re.compile(r"Recording episode (\d+)$")
-"""What LeRobot's loops log when an episode begins."""
-RESETTING = "Reset the environment"
-"""What they log between episodes."""
-RETURNING = "Returning robot to initial position"
-"""What they log before they move the robot back."""
+RECORDING = {
+    ("lerobot.scripts.lerobot_record", "record_loop"): ("dataset", "start_episode_t"),
+    ("lerobot.rollout.strategies.episodic", "_policy_loop"): ("dataset", "start_t"),
+}
+"""LeRobot's loops that record an episode, or nothing if their dataset is None -> names of it and of when they began."""
+BETWEEN = {
+    ("lerobot.rollout.strategies.episodic", "_reset_loop"),
+    ("lerobot.rollout.strategies.episodic", "run"),
+    ("lerobot.rollout.strategies.core", "_return_to_initial_position"),
+}
+"""Those that move a robot between episodes."""
 
 EVALUATION = "lerobot.scripts.lerobot_eval"
 """The module of LeRobot's evaluation, whose `rollout` begins each episode by `policy.reset()`."""
@@ -59,6 +63,33 @@ def waits_for_actions() -> bool:
             return True
         frame = frame.f_back
     return False
+
+
+class Loop(NamedTuple):
+    """A loop of LeRobot's that drives a robot.
+
+    Attributes:
+        episode: the number of the one that it records; None between episodes.
+        began: when, by LeRobot's clock; it tells two loops that record the same episode.
+    """
+
+    episode: int | None
+    began: float | None
+
+
+def calling_loop() -> Loop | None:
+    """The loop that records, or moves a robot between episodes, if one of them is calling: LeRobot tells no robot."""
+    frame = sys._getframe(1)
+    while frame is not None:
+        spec = frame.f_globals.get("__spec__")  # its name is the module's even if that is run as a program
+        place = getattr(spec, "name", None) or frame.f_globals.get("__name__"), frame.f_code.co_name
+        if place in RECORDING:
+            dataset, began = (frame.f_locals.get(name) for name in RECORDING[place])
+            return Loop(None if dataset is None else dataset.num_episodes, began)
+        if place in BETWEEN:
+            return Loop(None, None)
+        frame = frame.f_back
+    return None
 
 
 def drop_episode_statistics(root: Path, features: list[str]) -> None:
