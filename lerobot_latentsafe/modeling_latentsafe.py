@@ -21,6 +21,7 @@ from lerobot_latentsafe.base_policy import BasePolicy
 from lerobot_latentsafe.configuration_latentsafe import SEALED, LatentSafeConfig
 from lerobot_latentsafe.datasets.adoption import adopt_dataset, check_candidates
 from lerobot_latentsafe.datasets.clips import FilterData
+from lerobot_latentsafe.datasets.live_cameras import looks_of
 from lerobot_latentsafe.decision import FilterDecision, LawOptions, Reason
 from lerobot_latentsafe.guard import standing_still
 from lerobot_latentsafe.model_card import make_model_card
@@ -342,6 +343,8 @@ def adopt(config: LatentSafeConfig, meta: LeRobotDatasetMetadata) -> FilterData:
         data.check_cameras({key: config.input_features[key].shape for key in data.cameras})
     trained_on = adopt_dataset(config.trained_on, data.contract)
     trained_on.cameras = list(data.cameras)
+    if trained_on.looks is None:
+        trained_on.looks = looks_of(meta, data.contract, trained_on, data.cache)
     check_candidates(config.fallback.action_candidates, trained_on, meta.repo_id)
     features = {key: feature for key, feature in config.input_features.items() if key not in data.contract.left_out}
     features |= {key: PolicyFeature(FeatureType.VISUAL, shape) for key, shape in data.cameras.items()}

@@ -12,6 +12,7 @@ from functools import cached_property
 import torch
 from torch import Tensor, nn
 
+from lerobot_latentsafe.looks import Look
 from lerobot_latentsafe.meanings import Command, parse
 
 STAGES = ("untrained", "guard", "world_model", "critic")
@@ -53,6 +54,8 @@ class TrainedOn:
             size is displacement_scale; 0, 0 and 1 for commands that are no targets.
         state_low, state_high, state_mean, state_std: of the data.
         state_step: by how much each number of the state changes from frame to frame at most.
+        unanswered: how far each command goes at most while the state stays as it is; see `looks.Response`.
+        looks: camera key -> what its pictures have in common.
     """
 
     stage: str = "untrained"
@@ -77,6 +80,8 @@ class TrainedOn:
     state_step: list[float] | None = None
     state_mean: list[float] | None = None
     state_std: list[float] | None = None
+    unanswered: list[float] | None = None
+    looks: dict[str, Look] | None = None
 
     def __post_init__(self) -> None:
         if self.stage not in STAGES:
