@@ -213,7 +213,8 @@ def _entry(config: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def _config_digest(folder: Path, entries: Sequence[str]) -> str:
-    config, sealed = read_json(folder / CONFIG), {}
+    config = read_json(folder / CONFIG)
+    sealed: dict[str, Any] = {}
     for name in entries:
         sealed |= _entry(config, name)
     return hashlib.sha256(json.dumps(sealed, sort_keys=True).encode()).hexdigest()
