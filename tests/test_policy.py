@@ -18,7 +18,7 @@ from lerobot_latentsafe.configuration_latentsafe import SEALED
 from lerobot_latentsafe.datasets.adoption import adopt_dataset
 from lerobot_latentsafe.datasets.contract import Contract
 from lerobot_latentsafe.decision import Reason
-from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, UntrainedFilterError
+from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, UntrainedFilterError, adopt
 from lerobot_latentsafe.runtime.checkpoint import CheckpointError, resolve_checkpoint, seal
 from lerobot_latentsafe.runtime.hub import save_policy
 from lerobot_latentsafe.training import train_reachability
@@ -259,7 +259,7 @@ def test_dataset_of_other_pictures_is_refused(tiny_world_model, dataset_meta):
     config = PreTrainedConfig.from_pretrained(tiny_world_model)
     config.frame_cache, config.input_features["observation.image"].shape = None, (3, 96, 128)
     with pytest.raises(ValueError, match=r"observation\.image has shape \(3, \d+, \d+\).*trained on \(3, 96, 128\)"):
-        load(tiny_world_model, config=config, dataset_meta=dataset_meta)
+        adopt(config, dataset_meta)
 
 
 @pytest.mark.parametrize("candidates", [[[9.0, 1.0]], [[0.0, 1.0], [-1.3, 1.0]], [[0.0]], [[0.0, 1.0, 0.0]]])
