@@ -239,7 +239,7 @@ class Guard:
             size = len(self.model.units.state_names)
             fits = value.dim() == 2 and value.shape[1] == size
             return None if fits else f"{key} has shape {tuple(value.shape)}, expected (robots, {size})"
-        if not value.is_floating_point() or value.dim() != 4:
+        if not value.is_floating_point() or value.dim() != 4 or not value.numel():
             return (
                 f"{key} has shape {tuple(value.shape)} of {value.dtype}, expected (robots, channels, height, width) of "
                 "floats in [0, 1]"
