@@ -116,7 +116,7 @@ class Guard:
     def __init__(self, model: SafetyModel):
         self.model, units = model, model.units
         self.cameras = Cameras(model.world_model.image_keys, model.config.trained_on.looks)
-        self.response = Response(AT_REST * units.state_step, units.adds_up, units.unanswered)
+        self.response = Response(AT_REST * units.state_step, units.adds_up, units.furthest_unanswered)
         self._begun = False
         self._said: set[tuple[str, str]] = set()
         self.reset()
@@ -156,6 +156,7 @@ class Guard:
         fault = first_fault(fault, ~finite, Reason.OBSERVATION_NOT_FINITE)
         fault = first_fault(fault, ~believed, Reason.OBSERVATION_OUT_OF_RANGE)
         fault = self._compare(pictures, state, fault)
+        self.response.see(state, self.model.units.unknown(n) if self.told is None else self.told)
         self._begun = True
         return Seen({key: self.model.images(picture).clamp(0, 1) for key, picture in pictures.items()}, state, fault)
 
@@ -169,11 +170,7 @@ class Guard:
             fault = first_fault(fault, dead, Reason.OBSERVATION_MISSING)
             fault = first_fault(fault, unfamiliar, Reason.OBSERVATION_UNFAMILIAR)
             fault = first_fault(fault, old, Reason.OBSERVATION_STALE)
-        told = torch.full_like(self.model.units.action_low.expand(len(state), -1), torch.nan)
-        mute = self.response.is_missing(state, told if self.told is None else self.told)
-        if mute.any():
-            self.say_once("the state stays as it is whatever is sent: nothing passes until it changes, or reset()")
-        return first_fault(fault, mute, Reason.OBSERVATION_STALE)
+        return fault
 
     def _see_state(self, given: dict[str, Any], n: int) -> tuple[Tensor, Tensor, Tensor]:
         """The usable numbers of the state (B, S), whether all are finite (B,), and whether all are believed (B,)."""
@@ -275,6 +272,10 @@ class Guard:
         fault = first_fault(fault, out_of_range, Reason.ACTION_OUT_OF_RANGE)
         fault = first_fault(fault, units.leaps(clipped, self._proposals), Reason.ACTION_JUMPS)
         self._proposals.append(clipped)
+        mute = self.response.is_missing(clipped)
+        if mute.any():
+            self.say_once("the state stays as it is, whatever is sent: the robot goes no further until it changes")
+        fault = first_fault(fault, mute, Reason.OBSERVATION_STALE)
         return fault, proposed, self._tell_clipped(proposed, clipped, fault)
 
     def _is_action(self, proposed: Any, hold: Tensor) -> bool:

@@ -235,6 +235,16 @@ class Units(nn.Module):
             return state.new_full((*state.shape[:-1], len(self.action_low)), torch.nan)
         return torch.where(self._shown_by >= 0, state[..., self._shown_by.clamp(min=0)], torch.nan)
 
+    @property
+    def furthest_unanswered(self) -> Tensor:
+        """How far each command may go while the state stays as it is: (A,); infinite where that is never told."""
+        twice = 2 * (self.unanswered + torch.maximum(self.motion_low.abs(), self.motion_high.abs()))
+        return torch.where(self.action_varies & ~self.frozen, twice, torch.inf)
+
+    def unknown(self, n: int) -> Tensor:
+        """Actions of which nothing is known, NaN: (n, A)."""
+        return torch.full((n, len(self.action_low)), torch.nan, device=self.device)
+
     def first_action(self, action: Tensor) -> Tensor:
         """What counts as having led to the first frame of an episode: no motion, frozen commands as in `action`."""
         return torch.where(self.frozen, action, 0.0)
