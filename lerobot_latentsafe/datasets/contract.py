@@ -143,6 +143,11 @@ class Contract:
                 f"--operation.episode_indices='{affected}'"
             )
 
+    def only(self, episodes: list[int] | None) -> "Contract":
+        """The same of these episodes alone; None: all."""
+        kept = np.isin(self.episode, self.episode if episodes is None else episodes)
+        return replace(self, episode=self.episode[kept], state=self.state[kept], action=self.action[kept])
+
     @property
     def statistics(self) -> dict[str, dict[str, np.ndarray]]:
         """Feature -> min, max, mean, std and count of its numbers, as LeRobot's `meta/stats.json` has them."""
