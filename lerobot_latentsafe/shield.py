@@ -103,6 +103,7 @@ class Shield:
         age_s: float = 0.0,
         missing_reason: Reason = Reason.BASE_POLICY_FAILED,
         fault: Reason = Reason.PASSED,
+        planned: Tensor | None = None,
     ) -> FilterDecision:
         """Decide on one proposed action.
 
@@ -112,6 +113,7 @@ class Shield:
             age_s: seconds since before the observation was taken.
             missing_reason: the reason to give where there is no proposal.
             fault: what the caller has found wrong, if anything.
+            planned: (B, N, A) in robot units, what is to come after `proposed`, if it was just planned.
 
         Returns:
             The decision, also kept as `self.decision`; use the one that is returned, others may decide meanwhile.
@@ -132,7 +134,7 @@ class Shield:
             seen = self.guard.observe(observation)
             faults = self._late(seen.fault, age_s, Reason.OBSERVATION_STALE)
             hold = self.guard.hold(seen.state)
-            faults, proposed, clipped = self.guard.check_action(proposed, faults, hold, missing_reason)
+            faults, proposed, clipped = self.guard.check_action(proposed, faults, hold, missing_reason, planned)
             for found in (fault, rate):
                 faults = first_fault(faults, torch.ones_like(faults, dtype=torch.bool), found)
             if self.recent is None:
