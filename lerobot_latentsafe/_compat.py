@@ -30,7 +30,9 @@ BETWEEN = {
 """Those that move a robot between episodes."""
 
 EVALUATION = "lerobot.scripts.lerobot_eval"
-"""The module of LeRobot's evaluation, whose `rollout` begins each episode by `policy.reset()`."""
+"""LeRobot's evaluation in simulation, which begins each episode by `policy.reset()`."""
+ROLLOUT = "lerobot.rollout"
+"""LeRobot's loops that run a policy on a robot; they do the same."""
 
 ADAPTER = "adapter_config.json"
 """The file beside a policy's config.json that makes it a PEFT adapter."""
@@ -55,11 +57,12 @@ def training_run() -> "TrainPipelineConfig | None":
     return None
 
 
-def waits_for_actions() -> bool:
-    """Whether LeRobot's evaluation in simulation is at work just now: it waits for every action, nothing is late."""
+def called_from(module: str) -> bool:
+    """Whether a module of LeRobot, or one in a package of it, is at work just now."""
     frame = sys._getframe(1)
     while frame is not None:
-        if frame.f_globals.get("__name__") == EVALUATION and frame.f_code.co_name == "rollout":
+        name = frame.f_globals.get("__name__", "")
+        if name == module or name.startswith(f"{module}."):
             return True
         frame = frame.f_back
     return False

@@ -150,12 +150,25 @@ class Response:
     """
 
     def __init__(self, rest: Tensor, adds_up: Tensor, limit: Tensor | float = torch.inf):
-        self.rest, self.adds_up, self.limit = rest, adds_up, limit
+        self.rest, self.adds_up, self.limit = rest, adds_up, torch.as_tensor(limit)
         self.reset()
 
-    def is_missing(self, state: Tensor, sent: Tensor) -> Tensor:
-        """Which robots do not answer: bool (B,); see `unanswered`."""
-        return (self.unanswered(state, sent) > self.limit).any(-1)
+    def see(self, state: Tensor, sent: Tensor) -> None:
+        """Note the state of a tick, and what was executed before it; see `unanswered`."""
+        self._went = self.unanswered(state, sent)
+
+    def is_missing(self, proposed: Tensor) -> Tensor:
+        """Which robots do not answer, and would be led further from where they were seen: bool (B,).
+
+        What leads back passes, so that a robot that stands at its limits does not stand there for ever; and one whose
+        state is frozen never goes further than the limit, unseen.
+
+        Args:
+            proposed: (B, A), what is to be executed next.
+        """
+        place = torch.where(self.adds_up, self._sum + proposed, proposed)
+        back = (place - self._begin).abs() < self._went
+        return ((self._went > self.limit) & ~back).any(-1)
 
     def reset(self) -> None:
         """Start an episode."""
@@ -169,6 +182,9 @@ class Response:
             sent: (B, A), what was executed before it; NaN at the start of an episode.
         """
         if self._since is None:
+            self.rest, self.adds_up, self.limit = (
+                numbers.to(state.device) for numbers in (self.rest, self.adds_up, self.limit)
+            )
             self._since, self._begin, self._sum = state, sent, torch.zeros_like(sent)
         self._sum = self._sum + torch.where(self.adds_up, sent.nan_to_num(0.0), 0.0)
         place = torch.where(self.adds_up, self._sum, sent)

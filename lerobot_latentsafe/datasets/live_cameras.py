@@ -26,6 +26,7 @@ def looks_of(
     """What the cameras of a dataset look like.
 
     Args:
+        contract: of all episodes, or of those to look at if the dataset has its pictures.
         trained_on: names the cameras, and gives the means and deviations of the state.
         cache: of the dataset's frames, if they are cached.
 
@@ -34,7 +35,7 @@ def looks_of(
     """
     cameras = trained_on.cameras
     if set(cameras) <= {*meta.camera_keys}:
-        frames = DatasetFrames(meta)
+        frames = DatasetFrames(meta, np.unique(contract.episode).tolist())
         pieces: Pieces = lambda e: frames.pieces(cameras, frames.episodes[e])  # noqa: E731
     elif cache is not None and set(cameras) <= {*cache.percepts}:
         pieces = lambda e: _cached(cache, cameras, *_rows(contract, e))  # noqa: E731

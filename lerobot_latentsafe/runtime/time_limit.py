@@ -37,7 +37,7 @@ class TimeLimit:
     """Does one thing at a time in another thread, and waits for it no longer than it is told.
 
     What takes longer goes on, and its result is dropped; until it has ended, everything else is refused as late. What
-    torch keeps by thread (gradients, inference mode, autocast, its number of threads) is as where the work is asked for.
+    torch keeps by thread (gradients, inference mode, autocast, number of threads) is as where the work is asked for.
     """
 
     def __init__(self, device_type: str = "cpu"):
