@@ -1,24 +1,38 @@
 """The policy to be shielded: any LeRobot policy with its own processors."""
 
-import json
 import logging
 from collections.abc import Sequence
 from pathlib import Path
 
+from lerobot.configs.parser import parse_arg
 from lerobot.configs.policies import PreTrainedConfig
-from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from lerobot.policies.factory import get_policy_class
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.processor import PolicyProcessorPipeline, RelativeActionsProcessorStep
 from lerobot.utils.constants import OBS_STATE
+from lerobot.utils.import_utils import require_package
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from lerobot_latentsafe._compat import ADAPTER, forget_plan, is_lerobots, merged_adapter
 from lerobot_latentsafe.action_chunks import ChunksAhead
 from lerobot_latentsafe.origin import Origin, inverse, order
-from lerobot_latentsafe.runtime.checkpoint import WEIGHTS, CheckpointError, read_config, resolve_checkpoint
+from lerobot_latentsafe.runtime.checkpoint import (
+    BASE_FOLDER,
+    CONFIG,
+    WEIGHTS,
+    CheckpointError,
+    inside,
+    named_by,
+    read_config,
+    read_json,
+    resolve_checkpoint,
+)
+from lerobot_latentsafe.runtime.processors import DownloadedCodeError, load_processors, no_downloaded_code
 
 logger = logging.getLogger(__name__)
+
+ADAPTER_WEIGHTS = "adapter_model.safetensors"
 
 
 class BasePolicy:
@@ -52,16 +66,14 @@ class BasePolicy:
         """The policy of a folder, a Hub id or the name of a committed checkpoint; or a PEFT adapter of one, merged.
 
         Raises:
-            CheckpointError: no policy there, or one that cannot be read.
+            CheckpointError: no policy there, one that cannot be read, or one that asks for code to be run.
             ValueError: it is itself a filter, or cannot choose one action at a time.
         """
         folder = resolve_checkpoint(path)
         config = read_config(folder, device)
         _refuse_filter(config, path)
         policy = _load_policy(folder, config)
-        preprocessor, postprocessor = make_pre_post_processors(
-            config, pretrained_path=folder, preprocessor_overrides={"device_processor": {"device": device}}
-        )
+        preprocessor, postprocessor = load_processors(config, folder, device)
         return cls(policy, preprocessor, postprocessor, ahead, Origin.of(config, folder))
 
     @property
@@ -127,15 +139,39 @@ class BasePolicy:
         self.origin.save(folder)
 
 
+def base_to_shield(folder: Path, chosen: str | None) -> str | None:
+    """The policy that a filter of this folder is to shield: what the user chose, or else the one in the folder.
+
+    Args:
+        chosen: of the configuration in use. What differs from the folder's own, or was typed, is the user's choice.
+
+    Raises:
+        CheckpointError: the folder's own configuration names another place, or nothing is there.
+    """
+    own = read_json(folder / CONFIG).get("base_policy_path")
+    if chosen is None or chosen != own or chosen == parse_arg("policy.base_policy_path"):
+        return chosen
+    base = inside(folder, BASE_FOLDER)
+    if own != BASE_FOLDER or base is None or (base / ADAPTER).exists():
+        raise CheckpointError(
+            f"{folder / CONFIG} names the base policy {own}; expected {BASE_FOLDER}, a folder in {folder} that holds a "
+            "whole policy. What a checkpoint's file names is not fetched, and not looked for elsewhere. If you want "
+            "that policy shielded, say so yourself: --policy.base_policy_path=... in LeRobot's commands, "
+            "--base_policy_path=... in ours, load_filter(..., base_policy=...) in Python"
+        )
+    return str(base)
+
+
 def _load_policy(folder: Path, config: PreTrainedConfig) -> PreTrainedPolicy:
     kind = get_policy_class(config.type)
     try:
-        if (folder / ADAPTER).exists():
-            return _load_adapted(kind, folder, config)
-        with safe_open(folder / WEIGHTS, "pt"):  # some policies of LeRobot go on with random weights
-            pass
-        return kind.from_pretrained(folder, config=config, strict=True)
-    except (SafetensorError, RuntimeError, FileNotFoundError) as e:
+        with no_downloaded_code(config):
+            if (folder / ADAPTER).exists():
+                return _load_adapted(kind, folder, config)
+            with safe_open(folder / WEIGHTS, "pt"):  # some policies of LeRobot go on with random weights
+                pass
+            return kind.from_pretrained(folder, config=config, strict=True)
+    except (SafetensorError, RuntimeError, OSError, MemoryError) as e:
         raise CheckpointError(f"base policy {folder}: weights unreadable or not its own ({e}); copy it again") from e
     except ImportError as e:
         raise CheckpointError(f"base policy {folder} ({config.type}) needs a package that is not here: {e}") from e
@@ -143,12 +179,21 @@ def _load_policy(folder: Path, config: PreTrainedConfig) -> PreTrainedPolicy:
 
 def _load_adapted(kind: type[PreTrainedPolicy], folder: Path, config: PreTrainedConfig) -> PreTrainedPolicy:
     """The policy that a PEFT adapter was trained on, with the adapter merged into it."""
-    adapter = json.loads((folder / ADAPTER).read_text())
-    adapted = adapter.get("base_model_name_or_path")
-    if not adapted:
+    adapter = read_json(folder / ADAPTER)
+    adapted, revision = adapter.get("base_model_name_or_path"), adapter.get("revision")
+    if not adapted or not isinstance(adapted, str):
         raise CheckpointError(f"{folder / ADAPTER} names no base_model_name_or_path: write there what was adapted")
+    imported = [name for name in ("auto_mapping", "megatron_config") if adapter.get(name)]
+    if imported:  # peft imports the modules that these name
+        raise DownloadedCodeError(f"{folder / ADAPTER} sets {', '.join(imported)}, which names code; expected null")
+    fetch = f"hf download {adapted}" + (f" --revision={revision}" if revision else "")
+    remedy = f"If you trust what it adapts: {fetch}, or write the name of a folder into {ADAPTER}"
     config.use_peft = False
-    policy = kind.from_pretrained(resolve_checkpoint(adapted, adapter.get("revision")), config=config, strict=True)
+    source = named_by(folder, adapted, remedy, revision)
+    policy = kind.from_pretrained(source, config=config, strict=True)
+    require_package("peft", extra="peft")
+    with safe_open(folder / ADAPTER_WEIGHTS, "pt"):  # peft would take a pickle instead
+        pass
     return merged_adapter(policy, folder)
 
 

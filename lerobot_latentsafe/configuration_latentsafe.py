@@ -19,6 +19,14 @@ from lerobot_latentsafe.world_models import RSSMConfig, WorldModelConfig
 
 SEALED = ("world_model", "fallback", "trained_on")
 """Groups that belong to the weights; the others are the user's."""
+SEALED_ENTRIES = (
+    *SEALED,
+    "input_features",
+    *(f"margin.{name}" for name in ("hidden", "layers", "failure_specification")),
+    *(f"reachability.{name}" for name in ("critic_hidden", "actor_hidden", "activation", "components")),
+    "normalization_mapping",
+)
+"""All that decides what the weights mean. Of margin and reachability the rest is about training."""
 
 
 class CriticTargetError(ValueError):

@@ -16,14 +16,14 @@ from torch import Tensor
 
 from lerobot_latentsafe.decision import Reason, first_fault
 from lerobot_latentsafe.encoders.pictures import check_proportions
+from lerobot_latentsafe.looks import Cameras, Response
 from lerobot_latentsafe.safety_model import SafetyModel
+from lerobot_latentsafe.units import AT_REST
 
 logger = logging.getLogger(__name__)
 
 PAUSE_S = 1.0
 """After a pause between two decisions longer than this, what was seen before says nothing: the history starts anew."""
-FLAT = 1e-3
-"""Pictures whose numbers differ by less than this show nothing."""
 COLOUR_TOLERANCE = 1e-3
 """By so much the numbers of a picture may leave [0, 1], for float errors."""
 
@@ -114,13 +114,17 @@ class Guard:
     """
 
     def __init__(self, model: SafetyModel):
-        self.model = model
+        self.model, units = model, model.units
+        self.cameras = Cameras(model.world_model.image_keys, model.config.trained_on.looks)
+        self.response = Response(AT_REST * units.state_step, units.adds_up, units.furthest_unanswered)
         self._begun = False
-        self._said: set[str] = set()
+        self._said: set[tuple[str, str]] = set()
         self.reset()
 
     def reset(self) -> None:
         """Forget what was seen and told: call at the start of every episode."""
+        self.cameras.reset()
+        self.response.reset()
         self.pose: Tensor | None = None
         self.missed: Tensor | None = None
         self.told: Tensor | None = None
@@ -145,14 +149,28 @@ class Guard:
             fault = first_fault(fault, everyone, reason)
         given = {key: value for key, value in observation.items() if key not in broken}
         state, finite, believed = self._see_state(given, n)
-        images = {}
+        pictures = {}
         for key in self.model.world_model.image_keys:
-            images[key], fault, numbers = self._see_picture(key, given.get(key), fault)
+            pictures[key], fault, numbers = self._see_picture(key, given.get(key), fault)
             finite = finite & numbers
         fault = first_fault(fault, ~finite, Reason.OBSERVATION_NOT_FINITE)
         fault = first_fault(fault, ~believed, Reason.OBSERVATION_OUT_OF_RANGE)
+        fault = self._compare(pictures, state, fault)
+        self.response.see(state, self.model.units.unknown(n) if self.told is None else self.told)
         self._begun = True
-        return Seen(images, state, fault)
+        return Seen({key: self.model.images(picture).clamp(0, 1) for key, picture in pictures.items()}, state, fault)
+
+    def _compare(self, pictures: dict[str, Tensor], state: Tensor, fault: Tensor) -> Tensor:
+        """What is wrong beside the data's pictures, and beside what was shown and told before: faults (B,)."""
+        if pictures:
+            dead, unfamiliar, thumbnails = self.cameras.check(pictures)
+            old = self.cameras.repeats(thumbnails, self.model.units.normalise_state(state))
+            if (dead | unfamiliar).any():
+                self.say_once("; ".join(self.cameras.wrong))
+            fault = first_fault(fault, dead, Reason.OBSERVATION_MISSING)
+            fault = first_fault(fault, unfamiliar, Reason.OBSERVATION_UNFAMILIAR)
+            fault = first_fault(fault, old, Reason.OBSERVATION_STALE)
+        return fault
 
     def _see_state(self, given: dict[str, Any], n: int) -> tuple[Tensor, Tensor, Tensor]:
         """The usable numbers of the state (B, S), whether all are finite (B,), and whether all are believed (B,)."""
@@ -172,21 +190,18 @@ class Guard:
         return state, finite, usable.all(-1)
 
     def _see_picture(self, key: str, picture: Tensor | None, fault: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """A camera's pictures as the model takes them, what is wrong with them (B,), and whether they are finite."""
+        """A camera's pictures in [0, 1], what is wrong with them (B,), and whether they are finite (B,)."""
         model, everyone = self.model, torch.ones_like(fault, dtype=torch.bool)
         if picture is None:
             shape = model.config.input_features[key].shape
-            return model.images(torch.zeros(len(fault), *shape, device=model.device)), fault, everyone
+            return torch.zeros(len(fault), *shape, device=model.device), fault, everyone
         picture = model.place(picture)
         low, high = picture.amin((1, 2, 3)), picture.amax((1, 2, 3))  # aminmax is five times slower
         finite = torch.isfinite(low) & torch.isfinite(high)  # NaN if anything is
         colours = finite & (low >= -COLOUR_TOLERANCE) & (high <= 1 + COLOUR_TOLERANCE)
         if not colours.all():
             picture = picture.nan_to_num(0.0).clamp(0, 1)
-        # A camera that delivers one flat colour is covered or dead.
-        fault = first_fault(fault, high - low < FLAT, Reason.OBSERVATION_MISSING)
-        fault = first_fault(fault, finite & ~colours, Reason.OBSERVATION_MALFORMED)
-        return model.images(picture).clamp(0, 1), fault, finite
+        return picture, first_fault(fault, finite & ~colours, Reason.OBSERVATION_MALFORMED), finite
 
     def _check_shapes(self, observation: dict[str, Any]) -> tuple[int, dict[str, Reason]]:
         """The number of robots, and what is wrong with inputs that cannot be used at all."""
@@ -257,6 +272,10 @@ class Guard:
         fault = first_fault(fault, out_of_range, Reason.ACTION_OUT_OF_RANGE)
         fault = first_fault(fault, units.leaps(clipped, self._proposals), Reason.ACTION_JUMPS)
         self._proposals.append(clipped)
+        mute = self.response.is_missing(clipped)
+        if mute.any():
+            self.say_once("the state stays as it is, whatever is sent: the robot goes no further until it changes")
+        fault = first_fault(fault, mute, Reason.OBSERVATION_STALE)
         return fault, proposed, self._tell_clipped(proposed, clipped, fault)
 
     def _is_action(self, proposed: Any, hold: Tensor) -> bool:
@@ -308,8 +327,8 @@ class Guard:
 
     def say_once(self, what: str, which: str = "") -> None:
         """Warn of something, once."""
-        if what not in self._said:
-            self._said.add(what)
+        if (what, which) not in self._said:
+            self._said.add((what, which))
             logger.warning("%s%s", what, which and f": {which}")
 
 

@@ -7,9 +7,17 @@ from typing import Any
 
 from safetensors.torch import load_file, save_file
 
-from lerobot_latentsafe.configuration_latentsafe import SEALED
-from lerobot_latentsafe.runtime.checkpoint import CONFIG, INTEGRITY, WEIGHTS, CheckpointError, check_sealed, seal
-from lerobot_latentsafe.runtime.files import refuse_existing
+from lerobot_latentsafe.configuration_latentsafe import SEALED, SEALED_ENTRIES
+from lerobot_latentsafe.runtime.checkpoint import (
+    CONFIG,
+    INTEGRITY,
+    WEIGHTS,
+    CheckpointError,
+    check_sealed,
+    read_json,
+    seal,
+)
+from lerobot_latentsafe.runtime.files import refuse_existing, replacing_folder
 
 MOVED = {
     **{f"margin_{name}": ("margin", name) for name in ("hidden", "layers", "delta", "weight", "clips")},
@@ -77,22 +85,23 @@ def migrate_checkpoint(source: str | Path, output_dir: str | Path) -> list[str]:
     """
     source, output_dir = Path(source), Path(output_dir)
     refuse_existing(output_dir)
-    folders = [file.parent.relative_to(source) for file in source.rglob(CONFIG) if is_old(json.loads(file.read_text()))]
+    folders = [file.parent.relative_to(source) for file in source.rglob(CONFIG) if is_old(read_json(file))]
     if not folders:
         raise CheckpointError(f"{source} holds no filter of the old layout; nothing was written")
     for folder in folders:
         if (source / folder / INTEGRITY).exists():
             check_sealed(source / folder, SEALED_WHEN_FLAT)  # sealed anew, it would pass for what was saved
-    shutil.copytree(source, output_dir)
-    for folder in folders:
-        _migrate_in_place(output_dir / folder)
+    with replacing_folder(output_dir) as partial:
+        shutil.copytree(source, partial, dirs_exist_ok=True)
+        for folder in sorted(folders, key=lambda folder: -len(folder.parts)):  # a seal covers what lies inside
+            _migrate_in_place(partial / folder)
     return [str(folder) for folder in sorted(folders)]
 
 
 def _migrate_in_place(folder: Path) -> None:
-    config = migrated(json.loads((folder / CONFIG).read_text()))
+    config = migrated(read_json(folder / CONFIG))
     (folder / CONFIG).write_text(json.dumps(config, indent=4))
     tensors = load_file(folder / WEIGHTS)
     save_file({f"model.{name}": tensor for name, tensor in tensors.items()}, folder / WEIGHTS, {"format": "pt"})
     if (folder / INTEGRITY).exists():
-        seal(folder, SEALED)
+        seal(folder, SEALED_ENTRIES)

@@ -10,36 +10,40 @@ from typing import Any
 
 import torch
 from huggingface_hub import ModelCard
+from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
-from lerobot_latentsafe._compat import NOT_AVERAGED, waits_for_actions
-from lerobot_latentsafe.base_policy import BasePolicy
-from lerobot_latentsafe.configuration_latentsafe import SEALED, LatentSafeConfig
+from lerobot_latentsafe._compat import EVALUATION, NOT_AVERAGED, ROLLOUT, called_from
+from lerobot_latentsafe.base_policy import BasePolicy, base_to_shield
+from lerobot_latentsafe.configuration_latentsafe import SEALED, SEALED_ENTRIES, LatentSafeConfig
 from lerobot_latentsafe.datasets.adoption import adopt_dataset, check_candidates
 from lerobot_latentsafe.datasets.clips import FilterData
+from lerobot_latentsafe.datasets.live_cameras import looks_of
 from lerobot_latentsafe.decision import FilterDecision, LawOptions, Reason
 from lerobot_latentsafe.guard import standing_still
 from lerobot_latentsafe.model_card import make_model_card
 from lerobot_latentsafe.runtime.checkpoint import (
+    BASE_FOLDER,
     CheckpointError,
+    check_in_use,
     check_sealed,
     fitting_weights,
     read_config,
     resolve_checkpoint,
     seal,
+    writing_checkpoint,
 )
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
+from lerobot_latentsafe.runtime.processors import check_own_processors
 from lerobot_latentsafe.runtime.time_limit import TimeLimit
 from lerobot_latentsafe.safety_model import SafetyModel, UntrainedFilterError
 from lerobot_latentsafe.shield import Shield
 
 logger = logging.getLogger(__name__)
-
-BASE_FOLDER = "base_policy"
 
 
 class LatentSafePolicy(PreTrainedPolicy):
@@ -77,7 +81,6 @@ class LatentSafePolicy(PreTrainedPolicy):
         self._base: list[BasePolicy] = []  # in a list, so that its weights are not ours
         self._base_lost = False
         self._in_time = TimeLimit(self.model.device.type)
-        self._said_disarmed: str | None = None
         self.shield = Shield(self.model)
         if config.base_policy_path:
             self.attach(config.base_policy_path)
@@ -146,8 +149,9 @@ class LatentSafePolicy(PreTrainedPolicy):
 
     def reset(self) -> None:
         """Start an episode."""
-        if waits_for_actions():
+        if called_from(EVALUATION):  # a simulation waits for every action
             self.shield.clock = standing_still
+        self.shield.pace.strict |= called_from(ROLLOUT)
         self.shield.reset()
         if self.base:
             self._replan(None)
@@ -178,7 +182,6 @@ class LatentSafePolicy(PreTrainedPolicy):
             age_s: seconds since before the observation was taken.
         """
         self.model.require_trained_for_law()
-        self._say_if_disarmed()
         self.shield.offer()
         if self.base is None:
             return self._judge(batch, None, age_s, missing_reason=Reason.NO_BASE_POLICY)
@@ -225,14 +228,6 @@ class LatentSafePolicy(PreTrainedPolicy):
             self._base_lost = True
             self.shield.note_failure("the base policy could not plan anew", e)
 
-    def _say_if_disarmed(self) -> None:
-        """Warn, once in a while of each setting, of a law that does not heed what is seen."""
-        disarmed = self.config.law.disarmed
-        if disarmed != self._said_disarmed:
-            self._said_disarmed = disarmed
-            if disarmed:
-                logger.warning("THIS FILTER PROTECTS NOTHING BY ITS VALUES: %s", disarmed)
-
     @torch.compiler.disable
     def _judge(self, *given: Any, **options: Any) -> FilterDecision:
         """The shield's decision, in single precision under autocast and uncompiled: the same wherever it is made."""
@@ -255,21 +250,26 @@ class LatentSafePolicy(PreTrainedPolicy):
 
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
         config, base_path = self.config, self.config.base_policy_path
-        if self.base:
-            self.base.save(save_directory / BASE_FOLDER)
-            config.base_policy_path = BASE_FOLDER
+        config.base_policy_path = BASE_FOLDER if self.base else None
         try:
-            super()._save_pretrained(save_directory, state_dict=state_dict)
+            with writing_checkpoint(save_directory) as folder:
+                if self.base:
+                    self.base.save(folder / BASE_FOLDER)
+                super()._save_pretrained(folder, state_dict=state_dict)
+                seal(folder, SEALED_ENTRIES)
         finally:
             config.base_policy_path = base_path
-        seal(save_directory, SEALED)
 
     @classmethod
     def from_pretrained(
         cls, pretrained_name_or_path: str | Path | None, *, config: LatentSafeConfig | None = None,
         revision: str | None = None, strict: bool = True, **kwargs: Any,
     ) -> "LatentSafePolicy":  # fmt: skip
-        """Load from a folder, a committed name or a Hub id; refuses what is cut, edited or of another type."""
+        """Load from a folder, a committed name or a Hub id.
+
+        Raises:
+            CheckpointError: what is cut, edited, overridden or of another type, or names what it may not.
+        """
         if pretrained_name_or_path is None:
             raise CheckpointError(
                 "a latentsafe policy needs a trained filter: give --policy.path=<filter> "
@@ -278,16 +278,17 @@ class LatentSafePolicy(PreTrainedPolicy):
         hub = {k: kwargs.pop(k) for k in ("cache_dir", "token", "local_files_only", "force_download") if k in kwargs}
         folder = resolve_checkpoint(pretrained_name_or_path, revision, **{k: v for k, v in hub.items() if v})
         config = config or read_config(folder)
-        if not isinstance(config, LatentSafeConfig):
-            raise CheckpointError(
-                f"{pretrained_name_or_path} is a {config.type!r} policy, expected a 'latentsafe' filter; "
-                "policies to be shielded go to --base_policy_path"
-            )
-        check_sealed(folder, SEALED)
-        if config.base_policy_path == BASE_FOLDER and (folder / BASE_FOLDER).is_dir():
-            config.base_policy_path = str(folder / BASE_FOLDER)
-        with fitting_weights(folder):
-            return super().from_pretrained(folder, config=config, strict=True, **kwargs)
+        _check(folder, config, training="dataset_meta" in kwargs)
+        chosen, base = config.base_policy_path, base_to_shield(folder, config.base_policy_path)
+        config.base_policy_path = None  # it is attached when the weights are there
+        try:
+            with fitting_weights(folder):
+                policy = super().from_pretrained(folder, config=config, strict=True, **kwargs)
+        finally:
+            config.base_policy_path = chosen
+        if base is not None:
+            policy.attach(base)
+        return policy
 
     def generate_model_card(self, dataset_repo_id: str, model_type: str, license: str | None,
                             tags: list[str] | None, cfg=None, dataset_meta=None) -> ModelCard:  # fmt: skip
@@ -298,6 +299,26 @@ class LatentSafePolicy(PreTrainedPolicy):
 def _rows(batch: dict[str, Tensor]) -> int:
     """For how many robots an observation is."""
     return max((len(v) for v in batch.values() if isinstance(v, Tensor) and v.dim() > 1), default=1)
+
+
+def _check(folder: Path, config: PreTrainedConfig, training: bool) -> None:
+    """Refuse a filter that is not as it was saved, in the configuration that is used.
+
+    Raises:
+        CheckpointError: what is cut, edited, overridden or of another type.
+    """
+    if not isinstance(config, LatentSafeConfig):
+        raise CheckpointError(
+            f"{folder} is a {config.type!r} policy, expected a 'latentsafe' filter; "
+            "policies to be shielded go to --base_policy_path"
+        )
+    if config.use_peft:
+        raise CheckpointError(
+            f"--policy.use_peft of {folder} is true; a filter's weights take no adapter: leave it out"
+        )
+    check_sealed(folder, SEALED)
+    check_in_use(folder, config, SEALED_ENTRIES)
+    check_own_processors(config, folder, renames=training)
 
 
 def load_filter(
@@ -316,8 +337,11 @@ def load_filter(
         CheckpointError: nothing to load, or something cut, edited or of another type.
         ValueError: a law that is none, or a base policy of another action space.
     """
-    config = read_config(resolve_checkpoint(path), device)
-    policy = LatentSafePolicy.from_pretrained(path, config=config).eval()
+    folder = resolve_checkpoint(path)
+    config = read_config(folder, device)
+    if base_policy is not None and isinstance(config, LatentSafeConfig):
+        config.base_policy_path = None  # it is not even looked at
+    policy = LatentSafePolicy.from_pretrained(folder, config=config).eval()
     if law is not None:
         policy.config.change(law=policy.config.law.changed(law))
     if base_policy is not None:
@@ -342,6 +366,8 @@ def adopt(config: LatentSafeConfig, meta: LeRobotDatasetMetadata) -> FilterData:
         data.check_cameras({key: config.input_features[key].shape for key in data.cameras})
     trained_on = adopt_dataset(config.trained_on, data.contract)
     trained_on.cameras = list(data.cameras)
+    if trained_on.looks is None:
+        trained_on.looks = looks_of(meta, data.contract, trained_on, data.cache)
     check_candidates(config.fallback.action_candidates, trained_on, meta.repo_id)
     features = {key: feature for key, feature in config.input_features.items() if key not in data.contract.left_out}
     features |= {key: PolicyFeature(FeatureType.VISUAL, shape) for key, shape in data.cameras.items()}

@@ -122,6 +122,7 @@ class Shield:
             UnknownPoseError: a robot whose commands are targets has shown no usable state, and was told nothing yet.
         """
         self.model.require_trained_for_law()
+        self._say_if_disarmed()
         with self._lock:
             started, law = self.clock(), self.model.config.law
             rate = self.pace.tick(started, law.slack_ms)
@@ -146,6 +147,12 @@ class Shield:
             decision = replace(decision, heard=judged)
             self._remember(judgement, decision, observation, finished)
             return decision
+
+    def _say_if_disarmed(self) -> None:
+        """Warn once of each law that does not heed what is seen."""
+        disarmed = self.model.config.law.disarmed
+        if disarmed is not None:
+            self.guard.say_once("THIS FILTER DOES NOT ACT BY WHAT IT SEES", disarmed)
 
     def time_left(self, age_s: float, n: int = 1) -> float:
         """Seconds that a base policy may take for n robots, so that the decision after it is still in time."""

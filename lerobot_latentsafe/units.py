@@ -5,6 +5,7 @@ A motion is a command that is zero, or as it was, where nothing moves: a delta, 
 its displacement, the target minus the present state. So targets are converted where the state is known: here.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,6 +13,7 @@ from functools import cached_property
 import torch
 from torch import Tensor, nn
 
+from lerobot_latentsafe.looks import Look
 from lerobot_latentsafe.meanings import Command, parse
 
 STAGES = ("untrained", "guard", "world_model", "critic")
@@ -53,6 +55,8 @@ class TrainedOn:
             size is displacement_scale; 0, 0 and 1 for commands that are no targets.
         state_low, state_high, state_mean, state_std: of the data.
         state_step: by how much each number of the state changes from frame to frame at most.
+        unanswered: how far each command goes at most while the state stays as it is; see `looks.Response`.
+        looks: camera key -> what its pictures have in common.
     """
 
     stage: str = "untrained"
@@ -77,10 +81,14 @@ class TrainedOn:
     state_step: list[float] | None = None
     state_mean: list[float] | None = None
     state_std: list[float] | None = None
+    unanswered: list[float] | None = None
+    looks: dict[str, Look] | None = None
 
     def __post_init__(self) -> None:
         if self.stage not in STAGES:
             raise ValueError(f"stage is {self.stage!r}; expected one of {', '.join(STAGES)}")
+        if self.fps is not None and not 0 < self.fps < math.inf:
+            raise ValueError(f"fps is {self.fps!r}; expected frames a second, more than 0")
         if self.fps is not None and self.fps == round(self.fps):
             self.fps = round(self.fps)  # 15, not 15.0, wherever people read it
 
@@ -139,6 +147,8 @@ class Units(nn.Module):
     frozen: Tensor
     stays: Tensor
     is_target: Tensor
+    adds_up: Tensor
+    unanswered: Tensor
     motion_low: Tensor
     motion_high: Tensor
     loudest: Tensor
@@ -150,6 +160,7 @@ class Units(nn.Module):
         n_actions, n_states = len(trained_on.action_low), len(trained_on.state_mean)
         unknown = {
             "action_step": [torch.inf] * n_actions, "action_jerk": [torch.inf] * n_actions,
+            "unanswered": [torch.inf] * n_actions,
             "displacement_low": [0.0] * n_actions, "displacement_high": [0.0] * n_actions,
             "displacement_scale": [1.0] * n_actions, "state_low": [-torch.inf] * n_states,
             "state_high": [torch.inf] * n_states, "state_step": [torch.inf] * n_states,
@@ -162,6 +173,8 @@ class Units(nn.Module):
         commands = trained_on.commands
         self.register_buffer("action_varies", varies, persistent=False)
         self.register_buffer("is_target", torch.tensor([c.meaning == "target" for c in commands]), persistent=False)
+        adds_up = torch.tensor([c.meaning in ("delta", "velocity") for c in commands])
+        self.register_buffer("adds_up", adds_up, persistent=False)
         scale, targets = self.displacement_scale, self.is_target  # what is -1 and 1 inside, and the most that is heard
         self.register_buffer("motion_low", torch.where(targets, -scale, self.action_low), persistent=False)
         self.register_buffer("motion_high", torch.where(targets, scale, self.action_high), persistent=False)
@@ -221,6 +234,16 @@ class Units(nn.Module):
         if not len(self.state_names):
             return state.new_full((*state.shape[:-1], len(self.action_low)), torch.nan)
         return torch.where(self._shown_by >= 0, state[..., self._shown_by.clamp(min=0)], torch.nan)
+
+    @property
+    def furthest_unanswered(self) -> Tensor:
+        """How far each command may go while the state stays as it is: (A,); infinite where that is never told."""
+        twice = 2 * (self.unanswered + torch.maximum(self.motion_low.abs(), self.motion_high.abs()))
+        return torch.where(self.action_varies & ~self.frozen, twice, torch.inf)
+
+    def unknown(self, n: int) -> Tensor:
+        """Actions of which nothing is known, NaN: (n, A)."""
+        return torch.full((n, len(self.action_low)), torch.nan, device=self.device)
 
     def first_action(self, action: Tensor) -> Tensor:
         """What counts as having led to the first frame of an episode: no motion, frozen commands as in `action`."""

@@ -30,7 +30,7 @@ class Killed(BaseException):
 
 
 def names(folder):
-    return sorted(p.name for p in folder.iterdir() if not p.name.endswith(".lock"))
+    return sorted(p.name for p in folder.iterdir())
 
 
 @pytest.fixture
@@ -117,11 +117,11 @@ def test_what_a_killed_process_left_of_a_folder_is_cleared(tmp_path, ended):
 def test_a_scratch_folder_goes_with_its_block_or_with_the_next_that_writes_the_same(tmp_path, ended):
     (tmp_path / f".out.scratch.{ended}.partial").mkdir()
     with replacing_folder(tmp_path / "out") as folder:
-        assert names(tmp_path) == []
+        assert names(tmp_path) == [".out.lock"]
         with scratch_folder(tmp_path / "out") as scratch:
             fill(scratch / "part")
             (scratch / "part").rename(folder)
-        assert names(tmp_path) == [folder.name]
+        assert names(tmp_path) == [folder.name, ".out.lock"]
     assert names(tmp_path) == ["out"]
 
 
@@ -167,6 +167,7 @@ def test_two_at_once_are_told_apart_and_a_killed_one_holds_nothing(tmp_path):
             raise AssertionError("nothing begins")
     other.kill()
     other.wait()
+    assert names(tmp_path) == [".out.lock"]
     with locked_folder(out), replacing_folder(out) as folder:  # one thread may take it twice
         fill(folder)
     assert names(tmp_path) == ["out"]

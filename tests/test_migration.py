@@ -156,8 +156,9 @@ def test_what_lies_in_a_checkpoint_comes_along(tiny_filter, tiny_diffusion, tmp_
         ["wrap", f"--policy.path={tiny_filter}", f"--base_policy_path={tiny_diffusion}", "--law.epsilon=0.125",
          f"--output_dir={tmp_path / 'wrapped'}"]
     )  # fmt: skip
-    old = flatten(shutil.copytree(tmp_path / "wrapped", tmp_path / "old"))
+    old = shutil.copytree(tmp_path / "wrapped", tmp_path / "old")
     flatten(shutil.copytree(tiny_filter, old / "base_policy" / "world_model"))
+    flatten(old)
     main(["migrate-checkpoint", f"--policy.path={old}", f"--output_dir={tmp_path / 'new'}"])
     assert capsys.readouterr().out.count("migrated ") == 2
     assert_same(tmp_path / "new", tmp_path / "wrapped")

@@ -62,7 +62,7 @@ def undisturbed(tmp_path_factory):
 
 
 def left(folder):
-    return sorted(p.name for p in folder.iterdir() if not p.name.endswith(".lock"))
+    return sorted(p.name for p in folder.iterdir())
 
 
 def test_episodes_are_in_their_order(undisturbed):

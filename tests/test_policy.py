@@ -18,7 +18,7 @@ from lerobot_latentsafe.configuration_latentsafe import SEALED
 from lerobot_latentsafe.datasets.adoption import adopt_dataset
 from lerobot_latentsafe.datasets.contract import Contract
 from lerobot_latentsafe.decision import Reason
-from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, UntrainedFilterError
+from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, UntrainedFilterError, adopt
 from lerobot_latentsafe.runtime.checkpoint import CheckpointError, resolve_checkpoint, seal
 from lerobot_latentsafe.runtime.hub import save_policy
 from lerobot_latentsafe.training import train_reachability
@@ -197,7 +197,7 @@ def test_loaded_filter_cannot_be_trained_without_labels(policy):
 def test_filter_of_another_checkpoint_is_not_overwritten(tiny_world_model, tiny_filter, cache_meta):
     before = (tiny_filter / "model.safetensors").read_bytes()
     with pytest.raises(FileExistsError, match="another --output_dir"):
-        train_reachability(tiny_world_model, cache_meta, tiny_filter)
+        train_reachability(tiny_world_model, cache_meta, tiny_filter, seed=1)
     assert (tiny_filter / "model.safetensors").read_bytes() == before
 
 
@@ -259,7 +259,7 @@ def test_dataset_of_other_pictures_is_refused(tiny_world_model, dataset_meta):
     config = PreTrainedConfig.from_pretrained(tiny_world_model)
     config.frame_cache, config.input_features["observation.image"].shape = None, (3, 96, 128)
     with pytest.raises(ValueError, match=r"observation\.image has shape \(3, \d+, \d+\).*trained on \(3, 96, 128\)"):
-        load(tiny_world_model, config=config, dataset_meta=dataset_meta)
+        adopt(config, dataset_meta)
 
 
 @pytest.mark.parametrize("candidates", [[[9.0, 1.0]], [[0.0, 1.0], [-1.3, 1.0]], [[0.0]], [[0.0, 1.0, 0.0]]])

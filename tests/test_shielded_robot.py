@@ -353,6 +353,48 @@ def test_a_recording_stores_what_was_executed(tmp_path, epsilon, capsys):
     assert page.read_text().count("<video") == 1 and "me/shielded: 1 episodes" in page.read_text()
 
 
+def test_an_episode_that_is_recorded_again_keeps_its_last_decisions(trained, tmp_path, monkeypatch):
+    """The operator repeats the first episode, as soon as it has five frames."""
+    from lerobot_latentsafe.datasets.decisions import FILE, decision_columns
+    from lerobot_latentsafe.datasets.labels import read_frames
+
+    events = {"exit_early": False, "rerecord_episode": False, "stop_recording": False}
+    monkeypatch.setattr(lerobot_record, "init_keyboard_listener", lambda: (None, events))
+    add, frames = LeRobotDataset.add_frame, []
+
+    def repeat(dataset, frame):
+        add(dataset, frame)
+        frames.append(dataset.num_episodes)
+        if len(frames) == 5:
+            events.update(exit_early=True, rerecord_episode=True)
+
+    monkeypatch.setattr(LeRobotDataset, "add_frame", repeat)
+    root = tmp_path / "data"
+    cli.main(["record", *recording(trained, root)])
+    stored = read_frames(root, ["frame_index", "action"])
+    assert set(stored["episode_index"]) == {0, 1} and len(stored["index"]) == len(frames) - 5
+    assert len(decision_columns(root / FILE, stored)["value"]) == len(frames) - 5
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs fork")
+def test_a_recording_of_the_command_that_is_killed_goes_on(trained, tmp_path):
+    from test_killed_recording import killed
+
+    root = tmp_path / "data"
+    given = ["record", *recording(trained, root)]
+    killed(lambda: cli.main(given), "lerobot.datasets.dataset_metadata.write_stats", 2)
+    assert LeRobotDataset("me/shielded", root=root).num_episodes == 1
+    cli.main([*given, "--resume=true", "--dataset.num_episodes=1"])
+    merge = [f"--output_dir={tmp_path / 'merged'}", "--new_repo_id=me/merged"]
+    cli.main(["merge-decisions", "--dataset.repo_id=me/shielded", f"--dataset.root={root}", *merge])
+    assert LeRobotDataset("me/merged", root=tmp_path / "merged").num_episodes == 2
+
+
+def test_videos_are_saved_with_their_episode(trained, tmp_path):
+    with pytest.raises(SystemExit, match="video_encoding_batch_size is 3; expected 1"):
+        cli.main(["record", *recording(trained, tmp_path / "data"), "--dataset.video_encoding_batch_size=3"])
+
+
 def test_lerobots_own_commands_take_the_shielded_robot(trained, tmp_path, monkeypatch):
     """lerobot-replay of a bare recording, through the command line, filtered."""
     from lerobot.scripts import lerobot_record, lerobot_replay
@@ -382,10 +424,9 @@ def test_a_journal_goes_on_and_forgets_what_is_recorded_again(tmp_path):
 
     from lerobot_latentsafe.datasets.decisions import Journal
     from lerobot_latentsafe.decision import least_restrictive
-    from lerobot_latentsafe.robots.lerobot_events import RESETTING
 
-    def note(journal, announced, values):
-        journal.hear(announced)
+    def note(journal, episode, values):
+        journal.begin(episode)
         for value in values:
             judged = least_restrictive(torch.zeros(1, 2), torch.ones(1, 2), torch.tensor([value]), torch.ones(1), 0.0)
             journal.add(judged, [0.0, 1.0])
@@ -393,7 +434,7 @@ def test_a_journal_goes_on_and_forgets_what_is_recorded_again(tmp_path):
     path = tmp_path / "shield" / "decisions.parquet"
     first = Journal(path)
     note(first, 0, [0.5, -0.5])
-    note(first, RESETTING, [0.1])
+    note(first, None, [0.1])
     note(first, 1, [0.2, 0.2, 0.2])  # cut off, and recorded again when the recording goes on
     first.write()
     resumed = Journal(path)
@@ -420,7 +461,7 @@ def test_decisions_of_another_dataset_are_refused(tmp_path):
         decision_columns(tmp_path / "none.parquet", frames_of([0.0, 1.0]))
     torn = tmp_path / "torn.parquet"
     torn.write_bytes(b"PAR1")
-    with pytest.raises(ValueError, match="not a readable journal"):
+    with pytest.raises(ValueError, match="not a readable file of decisions"):
         decision_columns(torn, frames_of([0.0, 1.0]))
     journal = Journal(tmp_path / "decisions.parquet")
     judged = least_restrictive(torch.zeros(1, 2), torch.ones(1, 2), torch.ones(1), torch.ones(1), 0.0)
@@ -428,7 +469,7 @@ def test_decisions_of_another_dataset_are_refused(tmp_path):
         journal.add(judged, executed)
     journal.write()
     assert decision_columns(journal.path, frames_of([0.0, 1 / 3], [0.5, 1.0]))["value"].tolist() == [1.0, 1.0]
-    with pytest.raises(ValueError, match=r"no decision for episode 0, frame 2.*another dataset"):
+    with pytest.raises(ValueError, match=r"None was executed in episode 0, frame 2.*another dataset"):
         decision_columns(journal.path, frames_of([0.0, 1 / 3], [0.5, 1.0], [0.5, 1.0]))
     with pytest.raises(ValueError, match=r"\[0\.5, 1\.0\] was executed in episode 0, frame 1.*another dataset"):
         decision_columns(journal.path, frames_of([0.0, 1 / 3], [0.5, 0.9]))
@@ -543,7 +584,7 @@ def test_what_the_robot_clips_is_what_was_sent(robot, monkeypatch):
     assert robot.take_sent() is None
     for _ in range(2):
         robot.get_observation()
-        assert robot.send_action(PUSH) == robot.take_sent() == half(PUSH)
+        assert robot.send_action(PUSH) == half(PUSH) and robot.take_sent() == (half(PUSH), last(robot))
         assert robot.take_sent() is None
     assert sent == [PUSH, PUSH]
 
@@ -615,11 +656,28 @@ def alter(monkeypatch, how):
     elif how == "the class of datasets":
         add_half = type("Theirs", (LeRobotDataset,), {"add_frame": lambda self, f: self.writer.add_frame(halved(f))})
         monkeypatch.setattr(lerobot_record, "LeRobotDataset", add_half)
+    elif how == "frames that are stored already":
+
+        def double_the_first(dataset, frame):
+            add(dataset, frame)
+            dataset.writer.episode_buffer["action"][0] *= 2
+
+        monkeypatch.setattr(LeRobotDataset, "add_frame", double_the_first)
     elif how == "the dataset":
         monkeypatch.setattr(LeRobotDataset, "add_frame", lambda self, frame: add(self, halved(frame)))
 
 
-@pytest.mark.parametrize("how", ["processors of the operator", "processors of the robot", "the loop", "the command"])
+@pytest.mark.parametrize(
+    "how",
+    [
+        "processors of the operator",
+        "processors of the robot",
+        "the loop",
+        "the command",
+        "the dataset",
+        "the class of datasets",
+    ],
+)
 @pytest.mark.parametrize("epsilon", [ALWAYS, NEVER])
 def test_whatever_a_plugin_changes_the_dataset_holds_what_the_robot_was_sent(
     tmp_path, monkeypatch, executed, how, epsilon
@@ -637,9 +695,8 @@ def test_whatever_a_plugin_changes_the_dataset_holds_what_the_robot_was_sent(
     ("how", "words"),
     [
         ("names", "was to store tip_delta_x.*, and the robot was sent delta_x"),
-        ("the robot's names", "the operator commands tip_delta_x.*Nothing was sent"),
-        ("the dataset", r"was to store \[.*\], and the robot was sent \["),
-        ("the class of datasets", "the robot executed"),
+        ("the robot's names", "held still; use a teleoperator that commands delta_x"),
+        ("frames that are stored already", r"was to store \[.*\], and the robot was sent \["),
     ],
 )
 def test_a_recording_that_would_hold_something_else_is_refused(trained, tmp_path, monkeypatch, how, words):

@@ -52,7 +52,7 @@ def record_in_parts(
     """
     require_at_least("--dataset.num_episodes", n_episodes, 1)
     require_at_least("--workers", workers, 1)
-    root = Path(root)
+    root = Path(root).absolute()
     parts = root.with_name(f"{root.name}.parts")
     with locked_folder(root):
         if not _is_finished(root, repo_id, n_episodes, parts, options):

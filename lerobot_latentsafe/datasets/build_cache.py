@@ -55,6 +55,7 @@ from lerobot_latentsafe.runtime.malloc import keep_freed_memory
 from lerobot_latentsafe.runtime.options import require_at_least
 
 LAYOUT, DONE = "layout.json", "done.npy"
+TOKEN_TYPES = ("float16", "int8")
 ENCODED_AT_ONCE = 8
 """Frames an encoder reads together: few enough for its activations to stay in a CPU's cache."""
 TOGETHER = 2**21
@@ -133,8 +134,8 @@ class Tokens:
         self, cameras: list[str], image_size: int, config: PerceptionConfig, dtype: str = "float16",
         basis_from: str | Path | None = None,
     ):  # fmt: skip
-        if dtype not in ("float16", "int8"):
-            raise ValueError(f"--dtype is {dtype!r}; expected float16 or int8")
+        if dtype not in TOKEN_TYPES:
+            raise ValueError(f"--dtype is {dtype!r}; expected {' or '.join(TOKEN_TYPES)}")
         self.perception, self.dtype, self.basis_from = Perception(config, cameras, image_size), dtype, basis_from
         n_patches = self.perception.n_patches
         self.arrays = {

@@ -45,7 +45,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
     Whatever happens, the old or the new file is there, whole.
     """
-    path = Path(path)
+    path = Path(os.path.abspath(path))
     path.parent.mkdir(parents=True, exist_ok=True)
     _clear_partial(path)
     partial = _partial(path)
@@ -73,9 +73,9 @@ def replacing_folder(path: str | Path, option: str = "--output_dir") -> Iterator
         FileExistsError: something is there already, other than an empty folder.
         FolderInUseError: another process writes it.
     """
-    path = Path(path)
+    path = Path(os.path.abspath(path))
     with locked_folder(path):
-        if not _is_empty(path):
+        if not _is_empty(path) or path == Path.cwd():
             refuse_existing(path, option)
         partial = _partial(path)
         try:
@@ -96,7 +96,7 @@ def scratch_folder(path: str | Path) -> Iterator[Path]:
 
     After a kill it goes when `path` is written again.
     """
-    path = Path(path)
+    path = Path(os.path.abspath(path))
     folder = _partial(path.with_name(f"{path.name}.scratch"))
     folder.mkdir(parents=True)
     try:
@@ -128,6 +128,9 @@ def locked_folder(path: str | Path) -> Iterator[None]:
         _clear_partial(path)
         yield
     finally:
+        if lock.lock_counter == 1:
+            with suppress(OSError):  # Windows removes no open file
+                os.unlink(lock.lock_file)
         lock.release()
 
 

@@ -10,10 +10,10 @@ from lerobot.policies.factory import make_pre_post_processors
 from lerobot.policies.pretrained import PreTrainedPolicy
 from safetensors.torch import load_file, save_file
 
-from lerobot_latentsafe.runtime.checkpoint import INTEGRITY, WEIGHTS, seal_again
+from lerobot_latentsafe.runtime.checkpoint import WEIGHTS, seal_again, writing_checkpoint
 
-HUB_FAILURES = (HfHubHTTPError, OfflineModeIsEnabled, httpx.HTTPError, OSError)
-"""What huggingface_hub raises when the Hub does not answer or refuses."""
+HUB_FAILURES = (HfHubHTTPError, OfflineModeIsEnabled, httpx.HTTPError, OSError, RuntimeError)
+"""What huggingface_hub raises when the Hub does not answer or refuses; RuntimeError where weights are uploaded."""
 
 
 class HubUnreachableError(ConnectionError):
@@ -21,12 +21,22 @@ class HubUnreachableError(ConnectionError):
 
 
 def save_policy(policy: PreTrainedPolicy, output_dir: str | Path, half: bool = False) -> None:
-    """Write a policy with the processors LeRobot's commands expect; `half` stores 16-bit weights."""
-    policy.save_pretrained(output_dir)
-    if half:
-        halve_weights(output_dir)
-    for pipeline in make_pre_post_processors(policy.config):
-        pipeline.save_pretrained(output_dir)
+    """Write a policy with the processors LeRobot's commands expect, sealed if it seals itself.
+
+    Args:
+        half: store 16-bit weights.
+
+    Raises:
+        CheckpointWriteError: such as on a full disk; what was there before is as it was.
+    """
+    with writing_checkpoint(output_dir) as folder:
+        policy.save_pretrained(folder)
+        for pipeline in make_pre_post_processors(policy.config):
+            pipeline.save_pretrained(folder)
+        if half:
+            halve_weights(folder)
+        else:
+            seal_again(folder)
 
 
 def halve_weights(folder: str | Path) -> None:
@@ -34,8 +44,7 @@ def halve_weights(folder: str | Path) -> None:
     for file in Path(folder).rglob(WEIGHTS):
         tensors = {k: v.half() if v.is_floating_point() else v for k, v in load_file(file).items()}
         save_file(tensors, file, metadata={"format": "pt"})
-        if (file.parent / INTEGRITY).exists():
-            seal_again(file.parent)
+    seal_again(Path(folder))
 
 
 def push_policy(policy: PreTrainedPolicy, repo_id: str, dataset_repo_id: str, private: bool = False) -> str:
@@ -63,6 +72,7 @@ def push_policy(policy: PreTrainedPolicy, repo_id: str, dataset_repo_id: str, pr
             commit = api.upload_folder(repo_id=repo_id, folder_path=folder, commit_message=f"Push {policy.name} policy")
         except HUB_FAILURES as e:
             raise HubUnreachableError(
-                f"upload to {repo_id} broke off ({type(e).__name__}: {e}); the policy on disk is untouched, push again"
+                f"upload to {repo_id} broke off ({type(e).__name__}: {e.__cause__ or e}); the policy on disk is "
+                f"untouched and {repo_id} is as it was, for all files come at once: push again by the same command"
             ) from e
     return str(commit.repo_url)

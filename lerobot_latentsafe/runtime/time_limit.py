@@ -37,7 +37,7 @@ class TimeLimit:
     """Does one thing at a time in another thread, and waits for it no longer than it is told.
 
     What takes longer goes on, and its result is dropped; until it has ended, everything else is refused as late. What
-    torch keeps by thread (gradients, inference mode, autocast) is as it is where the work is asked for.
+    torch keeps by thread (gradients, inference mode, autocast, number of threads) is as where the work is asked for.
     """
 
     def __init__(self, device_type: str = "cpu"):
@@ -71,9 +71,12 @@ class TimeLimit:
 def _as_here(work: Callable[[], Any], device_type: str) -> Callable[[], Any]:
     """Work that finds torch's modes as they are in this thread."""
     inference, gradients = torch.is_inference_mode_enabled(), torch.is_grad_enabled()
+    threads = torch.get_num_threads()  # OpenMP has a number for each thread
     mixed, dtype = torch.is_autocast_enabled(device_type), torch.get_autocast_dtype(device_type)
 
     def work_there() -> Any:
+        if torch.get_num_threads() != threads:
+            torch.set_num_threads(threads)
         mode = torch.inference_mode() if inference else torch.set_grad_enabled(gradients)
         with mode, torch.autocast(device_type, dtype, enabled=mixed):
             return work()
