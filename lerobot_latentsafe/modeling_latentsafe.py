@@ -153,6 +153,7 @@ class LatentSafePolicy(PreTrainedPolicy):
             self.shield.clock = standing_still
         self.shield.pace.strict |= called_from(ROLLOUT)
         self.shield.reset()
+        self.shield.warm_up()
         if self.base:
             self._replan(None)
 
@@ -348,6 +349,7 @@ def load_filter(
         policy.config.change(law=policy.config.law.changed(law))
     if base_policy is not None:
         policy.attach(base_policy)
+    policy.shield.warm_up()
     return policy
 
 

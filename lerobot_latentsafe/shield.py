@@ -65,7 +65,7 @@ class Shield:
         self.model, self.clock, self.guard = model, clock, Guard(model)
         self.pace = Pace(model.config.trained_on.fps)
         self.failures: Counter[str] = Counter()
-        self.took_s = 0.0
+        self.took_s, self._warm = 0.0, False
         self._lock = threading.RLock()
         self._same_weights: weakref.WeakKeyDictionary[Shield, bool] = weakref.WeakKeyDictionary()
         keep_freed_memory()
@@ -94,6 +94,24 @@ class Shield:
         self.recent: Tensor | None = None
         self.retreated: Tensor | None = None
         self._told = False
+
+    @torch.no_grad()
+    def warm_up(self) -> None:
+        """Judge nothing once, between episodes, so that the first decision is no slower than the others."""
+        if not self.model.is_trained_for_law() or self._warm:
+            return
+        with self._lock, self.model.single_precision():
+            units, size = self.model.units, self.model.config.world_model.image_size
+            images = {key: torch.zeros(1, 3, size, size, device=units.device) for key in self.guard.cameras.keys}
+            self.guard.pose = units.state_mean[None]
+            hold, fault = (
+                units.hold(self.guard.pose).nan_to_num(0.0),
+                torch.zeros(1, dtype=torch.long, device=units.device),
+            )
+            self._forget_overrides(1)
+            self._judge(Seen(images, self.guard.pose, fault), fault, self._hear(hold), hold)
+            self._warm = True
+            self._forget()
 
     @torch.no_grad()
     def __call__(
