@@ -71,6 +71,11 @@ class ChunksAhead:
         self._next: Future[Tensor] | None = None
         self._ticks = 0
 
+    @property
+    def playing(self) -> deque[Tensor]:
+        """What is still to come of the chunk that is played: (B, A) each, in the policy's own units."""
+        return self._playing
+
     def act(self, batch: dict[str, Tensor]) -> Tensor:
         """The next action (B, A) of the policy's own units, given what it sees now."""
         self._batch, self._ticks = self._remember(batch), self._ticks + 1

@@ -7,6 +7,7 @@ answer is to stay, what that is. A shield is a guard with a world model.
 import copy
 import logging
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +19,7 @@ from lerobot_latentsafe.decision import Reason, first_fault
 from lerobot_latentsafe.encoders.pictures import check_proportions
 from lerobot_latentsafe.looks import Cameras, Response
 from lerobot_latentsafe.safety_model import SafetyModel
-from lerobot_latentsafe.units import AT_REST
+from lerobot_latentsafe.units import AT_REST, Units
 
 logger = logging.getLogger(__name__)
 
@@ -99,6 +100,26 @@ class Seen:
     images: dict[str, Tensor]
     state: Tensor
     fault: Tensor
+
+
+def check_plan(units: Units, plan: Tensor, before: Sequence[Tensor] = ()) -> Tensor:
+    """What is wrong with each of the actions that are planned, as far as that can be told before they are due.
+
+    Args:
+        plan: (B, N, A) in robot units.
+        before: the last actions (B, A) before them, at most two, the latest last.
+
+    Returns:
+        (B, N), a `Reason` each.
+    """
+    actions = torch.cat([*(action[:, None] for action in before), plan], 1)
+    leaps = torch.zeros(actions.shape[:2], dtype=torch.bool, device=plan.device)
+    leaps[:, 1:] |= units.leaps(actions[:, 1:], [actions[:, :-1]])
+    leaps[:, 2:] |= units.leaps(actions[:, 2:], [actions[:, :-2], actions[:, 1:-1]])
+    fault = torch.zeros(plan.shape[:2], dtype=torch.long, device=plan.device)
+    fault = first_fault(fault, ~plan.isfinite().all(-1), Reason.ACTION_NOT_FINITE)
+    fault = first_fault(fault, units.beyond(plan).any(-1), Reason.ACTION_OUT_OF_RANGE)
+    return first_fault(fault, leaps[:, len(before) :], Reason.ACTION_JUMPS)
 
 
 class Guard:
@@ -257,9 +278,13 @@ class Guard:
     # -- what the robots are to do ---
 
     def check_action(
-        self, proposed: Any, fault: Tensor, hold: Tensor, missing_reason: Reason
+        self, proposed: Any, fault: Tensor, hold: Tensor, missing_reason: Reason, planned: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Faults, the proposal and what of it lies in the data's range: (B,), (B, A), (B, A) in robot units."""
+        """Faults, the proposal and what of it lies in the data's range: (B,), (B, A), (B, A) in robot units.
+
+        Args:
+            planned: (B, N, A) in robot units, what is to come after the proposal, if that is known.
+        """
         units, everyone = self.model.units, torch.ones_like(fault, dtype=torch.bool)
         if proposed is not None and not self._is_action(proposed, hold):
             proposed, missing_reason = None, Reason.BASE_POLICY_FAILED
@@ -271,6 +296,11 @@ class Guard:
         clipped, out_of_range = units.clip(torch.where(finite[:, None], proposed, hold), self.pose)
         fault = first_fault(fault, out_of_range, Reason.ACTION_OUT_OF_RANGE)
         fault = first_fault(fault, units.leaps(clipped, self._proposals), Reason.ACTION_JUMPS)
+        if planned is not None:
+            plan = torch.cat([clipped[:, None], self.model.place(planned).float()], 1)
+            found = check_plan(units, plan)[:, 1:]
+            for reason in (Reason.ACTION_NOT_FINITE, Reason.ACTION_OUT_OF_RANGE, Reason.ACTION_JUMPS):
+                fault = first_fault(fault, (found == reason).any(1), reason)
         self._proposals.append(clipped)
         mute = self.response.is_missing(clipped)
         if mute.any():

@@ -1,10 +1,18 @@
-"""The filter's card on the Hub: what it saw, what it guards, how epsilon was set, what was measured, what it is not."""
+"""The filter's card on the Hub: what it saw, what it guards, how epsilon was set, what was measured, what it is not.
 
+Names come from datasets, files and the Hub: each is put into the card by `_said` or `_code`, and is text there.
+"""
+
+import html
 import json
+import math
+import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from huggingface_hub import ModelCard, ModelCardData
+from huggingface_hub.utils import HFValidationError, validate_repo_id
 
 from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
 from lerobot_latentsafe.decision import LAWS, RECENT, LawConfig
@@ -26,14 +34,14 @@ outside of what its data covered.
 
 | | |
 |---|---|
-| trained on | `{dataset}` |
+| trained on | {dataset} |
 | robot | {robot} |
 | cameras | {cameras} |
 | rate | {fps} fps |
 | actions (robot units) | {actions} |
 | proprioception | {states} |
 | world model | {world_model} |
-| failure specification | `{failure}` |
+| failure specification | {failure} |
 | stage | {stage} |
 | law | {law} |
 | epsilon | {epsilon} |
@@ -66,7 +74,7 @@ TASK_POLICY_TEXT = """---
 
 An actor-critic in the imagination of a world model (the DreamerV3 recipe) whose task is to {task}. It is the policy
 that a latent safety filter shields in our study: **it fails at times, on purpose**, for its reward prices failures
-instead of forbidding them. It was trained on `{dataset}`; its world model is in `world_model/`.
+instead of forbidding them. It was trained on {dataset}; its world model is in `world_model/`.
 
 ```bash
 pip install lerobot_policy_latentsafe
@@ -80,16 +88,48 @@ def make_task_policy_card(
 ) -> ModelCard:
     """The card of a `latentsafe_dreamer` policy."""
     header = _header(dataset_repo_id, license, tags, "latentsafe_dreamer", "world-model")
-    return ModelCard(TASK_POLICY_TEXT.format(header=header, task=task, dataset=dataset_repo_id, repo_id=repo_id))
+    names = {"task": _said(task), "dataset": _code(dataset_repo_id), "repo_id": _repository(repo_id, "me/policy")}
+    return ModelCard(TASK_POLICY_TEXT.format(header=header, **names))
+
+
+STRUCTURE = str.maketrans({sign: f"&#{ord(sign)};" for sign in "`*[]|\\~"})
+"""Signs that Markdown takes for structure -> entities, which it takes for text. Names have underscores inside words."""
+RATE = re.compile(r"\d+/\d+ = [\d.]+% \[[\d.]+, [\d.]+\]")
+"""What `rate_in_words` says, whose brackets stand for themselves."""
+PLAIN = re.compile(r"[\w ./:,=+@()'-]+")
+
+
+def _line(text: Any) -> str:
+    """A name on one line: what would begin a heading, or end the header, does not."""
+    return " ".join("".join(c if c.isprintable() else " " for c in str(text)).split())
+
+
+def _said(text: Any) -> str:
+    """A name as it is read: neither HTML nor Markdown."""
+    return html.escape(_line(text), quote=False).translate(STRUCTURE)
+
+
+def _code(text: Any) -> str:
+    """A name set as code, if nothing in it could end that."""
+    return f"`{_line(text)}`" if PLAIN.fullmatch(_line(text)) else _said(text)
+
+
+def _repository(repo_id: str | None, example: str) -> str:
+    """A repository to be typed in a command: an example if it is none."""
+    try:
+        validate_repo_id(str(repo_id or ""))
+    except HFValidationError:
+        return example
+    return str(repo_id or example)
 
 
 def _header(dataset_repo_id: str, license: str | None, tags: list[str] | None, name: str, kind: str) -> str:
     return ModelCardData(
-        license=license or "apache-2.0",
+        license=_line(license or "apache-2.0"),
         library_name="lerobot",
         pipeline_tag="robotics",
-        tags=sorted({*(tags or []), "robotics", "lerobot", name, kind}),
-        datasets=dataset_repo_id,
+        tags=sorted({*map(_line, tags or []), "robotics", "lerobot", name, kind}),
+        datasets=_line(dataset_repo_id),
         model_name=name,
     ).to_yaml()
 
@@ -114,17 +154,17 @@ def make_model_card(
     return ModelCard(
         TEXT.format(
             header=_header(dataset_repo_id, license, tags, "latentsafe", "safety-filter"),
-            dataset=dataset_repo_id,
+            dataset=_code(dataset_repo_id),
             **_robot(config),
             world_model=_world_model(config),
-            failure=config.margin.failure_specification,
+            failure=_code(config.margin.failure_specification),
             stage=config.trained_on.stage,
             law=f"{law.name}, V read after {law.proposal_steps} + {law.lookahead} imagined steps",
             epsilon=threshold(law),
-            fallback=fallback(law),
+            fallback=_said(fallback(law)),
             calibration=_calibration(config.calibration),
-            base=f"`{config.base_policy_path}`" if config.base_policy_path else "nothing yet",
-            repo_id=config.repo_id or "me/filter",
+            base=_code(config.base_policy_path) if config.base_policy_path else "nothing yet",
+            repo_id=_repository(config.repo_id, "me/filter"),
             imagination=_imagination(law.samples),
             confusion=_confusion(config.calibration),
             evaluation=_evaluation(config.evaluation),
@@ -136,21 +176,21 @@ def _robot(config: LatentSafeConfig) -> dict[str, str]:
     """What the filter sees and does, in words."""
     trained_on = config.trained_on
     return {
-        "robot": f"`{trained_on.robot_type}`" if trained_on.robot_type else "unknown",
-        "cameras": ", ".join(f"`{c}` {tuple(config.input_features[c].shape)}" for c in trained_on.cameras or []),
+        "robot": _code(trained_on.robot_type) if trained_on.robot_type else "unknown",
+        "cameras": ", ".join(f"{_code(c)} {tuple(config.input_features[c].shape)}" for c in trained_on.cameras or []),
         "fps": str(trained_on.fps),
         "actions": ", ".join(_command(c, trained_on) for c in trained_on.commands),
-        "states": ", ".join(trained_on.state_names or []),
+        "states": ", ".join(map(_said, trained_on.state_names or [])),
     }
 
 
 def _command(command: Command, trained_on: TrainedOn) -> str:
     """What a command means and how far it went in the data, in words."""
     (low, high), moves = trained_on.ranges[command.name], trained_on.motion_ranges[command.name]
-    text = f"{command.name} in [{low:g}, {high:g}]"
+    text = f"{_said(command.name)} in [{low:g}, {high:g}]"
     if trained_on.meanings is None:
         return text
-    text += f" ({command.described}"
+    text += f" ({_said(command.described)}"
     return f"{text}, at most {moves[0]:+.3g} to {moves[1]:+.3g} from the state)" if command.of_state else f"{text})"
 
 
@@ -173,8 +213,8 @@ def fallback(law: LawConfig) -> str:
 def _world_model(config: LatentSafeConfig) -> str:
     text = f"{config.world_model.type}, {config.world_model.image_size} px"
     if perception := getattr(config.world_model, "perception", None):
-        text += f", on {perception.components} components of the frozen encoder `{perception.encoder}`"
-        text += f" (weights {perception.encoder_hash}), which is not part of the checkpoint"
+        text += f", on {perception.components} components of the frozen encoder {_code(perception.encoder)}"
+        text += f" (weights {_said(perception.encoder_hash)}), which is not part of the checkpoint"
     frames = config.law.history_frames
     return text + (f"; remembers {frames} frames at most" if frames else "")
 
@@ -185,9 +225,21 @@ def _imagination(samples: int) -> str:
     return f"Imagination draws {samples} futures and believes the worst: what it did not draw is not foreseen."
 
 
+EVIDENCE = ("failing_episodes", "safe_frames", "missed", "lead_steps", "false_alarms")
+
+
+def _is_whole(evidence: dict[str, float]) -> bool:
+    """Whether `latentsafe calibrate` could have written this: counts, and shares of them."""
+    numbers = [evidence.get(name) for name in EVIDENCE]
+    counted = all(isinstance(n, int | float) and math.isfinite(n) and n >= 0 for n in numbers)
+    return counted and max(evidence["missed"], evidence["false_alarms"]) <= 1
+
+
 def _calibration(evidence: dict[str, float]) -> str:
     if not evidence:
         return "by hand"
+    if not _is_whole(evidence):
+        return "by latentsafe calibrate, whose evidence is not whole"
     return (
         f"on {evidence['failing_episodes']:.0f} held-out failing episodes: {evidence['missed']:.1%} warned later than "
         f"{evidence['lead_steps']:.0f} frames ahead, {evidence['false_alarms']:.1%} false alarms"
@@ -195,7 +247,7 @@ def _calibration(evidence: dict[str, float]) -> str:
 
 
 def _confusion(evidence: dict[str, float]) -> str:
-    if not evidence:
+    if not evidence or not _is_whole(evidence):
         return ""
     failing, safe = round(evidence["failing_episodes"]), round(evidence["safe_frames"])
     missed, alarms = round(evidence["missed"] * failing), round(evidence["false_alarms"] * safe)
@@ -206,7 +258,9 @@ def _confusion(evidence: dict[str, float]) -> str:
 def _evaluation(rates: dict[str, str]) -> str:
     if not rates:
         return ""
-    rows = "".join(f"| {what} | {rate} |\n" for what, rate in rates.items())
+    rows = "".join(
+        f"| {_said(what)} | {rate if RATE.fullmatch(rate) else _said(rate)} |\n" for what, rate in rates.items()
+    )
     return f"## Measured\n\nRates with 95% Wilson intervals.\n\n| | |\n|---|---|\n{rows}\n"
 
 
@@ -219,32 +273,49 @@ def measured(file: str | Path, law: str) -> dict[str, str]:
         ValueError: not a results file, or one without rates.
     """
     try:
-        content = json.loads(Path(file).read_text())
-    except (OSError, json.JSONDecodeError) as e:
+        content = json.loads(Path(file).read_text(encoding="utf-8"))
+        if not isinstance(content, dict):
+            raise ValueError(f"a {type(content).__name__}, expected an object")
+        rates = {", ".join(path): rate for path, rate in _rates(content, law)}
+    except (OSError, ValueError, RecursionError) as e:
         raise ValueError(f"--results={file} is not a readable results file ({e})") from e
-    rates = {", ".join(path): rate for path, rate in _rates(content, law)}
     if not rates:
         raise ValueError(
             f"--results={file} holds none of {', '.join(RATES)}; give a file of latentsafe eval-shield, "
             "scripts/bag_policies.py, scripts/bag_operators.py or scripts/bag_out_of_distribution.py"
         )
     source = {name: content.get(name, "unknown") for name in ("command", "commit", "date")}
-    made = f"`{source['command']}` at commit {source['commit']}, {source['date']}"
+    made = f"{source['command']} at commit {source['commit']}, {source['date']}"
     stem = Path(file).stem
     return {**{f"{stem}: {what}": rate for what, rate in rates.items()}, f"{stem}: made by": made}
 
 
 def rate_in_words(rate: dict[str, float]) -> str:
-    """`12/200 = 6.0% [3.5, 10.2]` from a Wilson record."""
-    k, n = rate["k"], rate["n"]
-    return f"{k}/{n} = {k / n:.1%} [{100 * rate['low']:.1f}, {100 * rate['high']:.1f}]"
+    """`12/200 = 6.0% [3.5, 10.2]` from a Wilson record.
+
+    Raises:
+        ValueError: no counts, more of a kind than there were, or an interval that is none.
+    """
+    k, n, low, high = (rate.get(name, math.nan) for name in ("k", "n", "low", "high"))
+    counted = all(isinstance(count, int) and not isinstance(count, bool) for count in (k, n)) and 0 <= k <= n
+    if counted and n == 0:
+        return "0/0, not measured"
+    if not counted or not all(isinstance(end, int | float) for end in (low, high)) or not 0 <= low <= high <= 1:
+        raise ValueError(f"{k!r} of {n!r} in [{low!r}, {high!r}] is no rate; expected counts and two shares, in order")
+    return f"{k}/{n} = {k / n:.1%} [{100 * low:.1f}, {100 * high:.1f}]"
+
+
+def _share_in_words(share: Any) -> str:
+    if not isinstance(share, int | float) or not 0 <= share <= 1:
+        raise ValueError(f"overridden_share is {share!r}; expected a share from 0 to 1")
+    return f"{share:.1%}"
 
 
 def _rates(content: dict, law: str, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], str]]:
     for name, entry in content.items():
         if "pooled" in content and name not in ("bare", "pooled"):
             continue
-        if not isinstance(entry, dict) or name.split()[-1] in {*LAWS} - {law}:
+        if not isinstance(entry, dict) or name.split()[-1:] in [[other] for other in LAWS if other != law]:
             continue
         if {"k", "n"} <= entry.keys():
             if name in RATES:
@@ -252,4 +323,4 @@ def _rates(content: dict, law: str, path: tuple[str, ...] = ()) -> Iterator[tupl
         else:
             yield from _rates(entry, law, (*path, name))
             if "overridden_share" in entry and name != "bare":
-                yield (*path, name, "steps overridden"), f"{entry['overridden_share']:.1%}"
+                yield (*path, name, "steps overridden"), _share_in_words(entry["overridden_share"])

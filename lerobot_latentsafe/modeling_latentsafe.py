@@ -153,6 +153,7 @@ class LatentSafePolicy(PreTrainedPolicy):
             self.shield.clock = standing_still
         self.shield.pace.strict |= called_from(ROLLOUT)
         self.shield.reset()
+        self.shield.warm_up()
         if self.base:
             self._replan(None)
 
@@ -187,7 +188,9 @@ class LatentSafePolicy(PreTrainedPolicy):
             return self._judge(batch, None, age_s, missing_reason=Reason.NO_BASE_POLICY)
         began = self.shield.clock()
         proposed, wrong = self._ask_base(batch, age_s)
-        decision = self._judge(batch, proposed, age_s + self.shield.clock() - began, missing_reason=wrong)
+        planned = None if proposed is None else self.base.planned
+        age_s += self.shield.clock() - began
+        decision = self._judge(batch, proposed, age_s, missing_reason=wrong, planned=planned)
         # A policy that is only late keeps its plan where the robots stayed meanwhile.
         stayed = wrong == Reason.DEADLINE_MISSED and self.shield.guard.holding.all()
         if decision.intervened.any() and not stayed:
@@ -346,6 +349,7 @@ def load_filter(
         policy.config.change(law=policy.config.law.changed(law))
     if base_policy is not None:
         policy.attach(base_policy)
+    policy.shield.warm_up()
     return policy
 
 

@@ -65,7 +65,7 @@ class Shield:
         self.model, self.clock, self.guard = model, clock, Guard(model)
         self.pace = Pace(model.config.trained_on.fps)
         self.failures: Counter[str] = Counter()
-        self.took_s = 0.0
+        self.took_s, self._warm = 0.0, False
         self._lock = threading.RLock()
         self._same_weights: weakref.WeakKeyDictionary[Shield, bool] = weakref.WeakKeyDictionary()
         keep_freed_memory()
@@ -96,6 +96,24 @@ class Shield:
         self._told = False
 
     @torch.no_grad()
+    def warm_up(self) -> None:
+        """Judge nothing once, between episodes, so that the first decision is no slower than the others."""
+        if not self.model.is_trained_for_law() or self._warm:
+            return
+        with self._lock, self.model.single_precision():
+            units, size = self.model.units, self.model.config.world_model.image_size
+            images = {key: torch.zeros(1, 3, size, size, device=units.device) for key in self.guard.cameras.keys}
+            self.guard.pose = units.state_mean[None]
+            hold, fault = (
+                units.hold(self.guard.pose).nan_to_num(0.0),
+                torch.zeros(1, dtype=torch.long, device=units.device),
+            )
+            self._forget_overrides(1)
+            self._judge(Seen(images, self.guard.pose, fault), fault, self._hear(hold), hold)
+            self._warm = True
+            self._forget()
+
+    @torch.no_grad()
     def __call__(
         self,
         observation: dict[str, Any],
@@ -103,6 +121,7 @@ class Shield:
         age_s: float = 0.0,
         missing_reason: Reason = Reason.BASE_POLICY_FAILED,
         fault: Reason = Reason.PASSED,
+        planned: Tensor | None = None,
     ) -> FilterDecision:
         """Decide on one proposed action.
 
@@ -112,6 +131,7 @@ class Shield:
             age_s: seconds since before the observation was taken.
             missing_reason: the reason to give where there is no proposal.
             fault: what the caller has found wrong, if anything.
+            planned: (B, N, A) in robot units, what is to come after `proposed`, if it was just planned.
 
         Returns:
             The decision, also kept as `self.decision`; use the one that is returned, others may decide meanwhile.
@@ -132,7 +152,7 @@ class Shield:
             seen = self.guard.observe(observation)
             faults = self._late(seen.fault, age_s, Reason.OBSERVATION_STALE)
             hold = self.guard.hold(seen.state)
-            faults, proposed, clipped = self.guard.check_action(proposed, faults, hold, missing_reason)
+            faults, proposed, clipped = self.guard.check_action(proposed, faults, hold, missing_reason, planned)
             for found in (fault, rate):
                 faults = first_fault(faults, torch.ones_like(faults, dtype=torch.bool), found)
             if self.recent is None:

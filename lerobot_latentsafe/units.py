@@ -256,9 +256,7 @@ class Units(nn.Module):
 
         A target also keeps to the displacements that the data show: a larger one is a jump.
         """
-        margin = RANGE_TOLERANCE * (self.action_high - self.action_low)
-        far = (action < self.action_low - margin) | (action > self.action_high + margin)
-        low, high = self.action_low, self.action_high
+        far, low, high = self.beyond(action), self.action_low, self.action_high
         if self.has_targets:
             pose, margin = self.seen(state), RANGE_TOLERANCE * (self.displacement_high - self.displacement_low)
             nearest, furthest = pose + self.displacement_low, pose + self.displacement_high
@@ -268,8 +266,13 @@ class Units(nn.Module):
             high = torch.where(self.is_target, torch.minimum(torch.maximum(high, pose), furthest), high)
         return torch.minimum(torch.maximum(action, low), high), far.any(-1)
 
+    def beyond(self, action: Tensor) -> Tensor:
+        """Which commands (..., A) leave the data's range by more than the tolerance, wherever the robot is."""
+        margin = RANGE_TOLERANCE * (self.action_high - self.action_low)
+        return (action < self.action_low - margin) | (action > self.action_high + margin)
+
     def leaps(self, action: Tensor, before: Sequence[Tensor]) -> Tensor:
-        """Whether commands (B, A) change faster than the data show, or change how they change: bool (B,).
+        """Whether commands (..., A) change faster than the data show, or change how they change: bool (...,).
 
         Args:
             before: the last actions, at most two, the latest last.

@@ -249,7 +249,7 @@ def test_card_names_the_encoder_and_what_was_measured(hub, seeing, tmp_path):
     for row in (
         "| policies: weak, bare, spilled | 70/100 = 70.0% [60.4, 78.1] |",
         "| policies: weak, reachability, pooled, steps overridden | 12.3% |",
-        "| policies: made by | `bag_policies.py` at commit abc, - |",
+        "| policies: made by | bag_policies.py at commit abc, - |",
         f"`efficientnet_lite0` (weights {seeing.config.world_model.perception.encoder_hash})",
     ):
         assert row in text

@@ -20,6 +20,8 @@ RANGE_SLACK = 0.25
 """Share of the range trained on by which another dataset's actions may exceed it."""
 SCALE_PERCENTILE = 99
 """Of the size of displacements: what is 1 inside. A single jerk of the operator must not make all else inaudible."""
+SMALL = 0.05
+"""Share of a command's range by which it may always change from tick to tick: that is no jump."""
 RARE, ABSURD = 1e-3, 10.0
 """Of the rarest such share of frames, what lies beyond all others by over so many times their range is a glitch."""
 
@@ -91,12 +93,13 @@ def with_limits(known: TrainedOn, contract: Contract) -> TrainedOn:
     """With how far, how fast and how suddenly states and commands go, where that is not known yet."""
     adds_up = np.array([c.meaning in ("delta", "velocity") for c in known.commands])
     state, rest = contract.state, _largest_step(contract)
+    small = SMALL * (np.array(known.action_high) - np.array(known.action_low))
     limits: dict[str, np.ndarray] = {
         "state_low": state.min(0),
         "state_high": state.max(0),
         "state_step": rest,
-        "action_step": _largest_change(contract, 1),
-        "action_jerk": _largest_change(contract, 2),
+        "action_step": np.maximum(_largest_change(contract, 1), small),
+        "action_jerk": np.maximum(_largest_change(contract, 2), small),
     }
     if contract.state_names:
         limits["unanswered"] = _unanswered(contract, AT_REST * rest, adds_up)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import pyarrow.parquet as pq
 from PIL import Image
 
+from lerobot_latentsafe.datasets.paths import stored_picture_bytes
 from lerobot_latentsafe.datasets.reading import DatasetContractError, reading
 
 if TYPE_CHECKING:  # the package imports this module, and LeRobot's datasets are heavy
@@ -51,13 +52,14 @@ def stored_picture(meta: "LeRobotDatasetMetadata", key: str) -> Image.Image:
     """The first picture of a camera whose pictures lie in the dataset's table; not decoded before it is looked at.
 
     Raises:
+        DatasetContractError: it lies outside of the dataset's folder.
         BrokenFileError: there is none, or it is none.
     """
     file = Path(meta.root) / meta.get_data_file_path(0)
     with reading(file):
         batch = next(pq.ParquetFile(file).iter_batches(batch_size=1, columns=[key]))
         stored = batch[key][0].as_py()
-        return Image.open(BytesIO(stored["bytes"]) if stored["bytes"] else Path(meta.root) / stored["path"])
+        return Image.open(BytesIO(stored_picture_bytes(Path(meta.root), stored)))
 
 
 def channels_first(key: str, feature: dict) -> tuple[int, int, int]:

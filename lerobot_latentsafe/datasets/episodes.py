@@ -11,6 +11,7 @@ import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from torch import Tensor
 
+from lerobot_latentsafe.datasets.paths import check_paths, stored_picture_bytes
 from lerobot_latentsafe.datasets.video_frames import video_frames
 
 MAX_HEIGHT = 480
@@ -30,7 +31,7 @@ class DatasetFrames:
         episodes: their numbers, in order.
 
     Raises:
-        ValueError: the dataset has no camera.
+        ValueError: the dataset has no camera, or names files outside of its folder.
         FileNotFoundError: a file of an episode is missing.
     """
 
@@ -43,6 +44,8 @@ class DatasetFrames:
                 f"{meta.repo_id} has no video and no images to look at; its features are {', '.join(meta.features)}. "
                 "A copy made by latentsafe cache has none: label the dataset it was made from, then cache again"
             )
+        paths = {"data_path": meta.data_path, "video_path": meta.video_path, "features": meta.features}
+        check_paths(self.root, paths)
         self._check_files()
 
     def _check_files(self) -> None:
@@ -125,7 +128,7 @@ class DatasetFrames:
             for place, index in enumerate(batch["index"].to_pylist()):
                 if index == awaited:
                     image, awaited = batch[camera][place].as_py(), next(wanted, None)
-                    yield image["bytes"] or (self.root / image["path"]).read_bytes()
+                    yield stored_picture_bytes(self.root, image)
         if awaited is not None:
             raise ValueError(
                 f"{path} lacks frame {awaited} of {self.meta.repo_id}, or holds its frames in another order than that "

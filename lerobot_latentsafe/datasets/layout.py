@@ -12,6 +12,7 @@ from typing import Any
 
 import pyarrow.parquet as pq
 
+from lerobot_latentsafe.datasets.paths import check_paths
 from lerobot_latentsafe.datasets.reading import DOWNLOAD_AGAIN, BrokenFileError, DatasetContractError, reading, some
 
 INFO, STATISTICS, TASKS, EPISODES = "meta/info.json", "meta/stats.json", "meta/tasks.parquet", "meta/episodes"
@@ -26,7 +27,7 @@ def check_layout(root: Path) -> dict[str, Any]:
     """The content of a dataset's `meta/info.json`, once all files of tables are found readable.
 
     Raises:
-        DatasetContractError: no folder, no dataset of version 3, or one that is empty.
+        DatasetContractError: no folder, no dataset of version 3, one that is empty, or one that names files elsewhere.
         BrokenFileError: a file that is missing, cut or damaged.
     """
     info = _read_info(root)
@@ -34,6 +35,7 @@ def check_layout(root: Path) -> dict[str, Any]:
         raise BrokenFileError(f"{root / TASKS} is missing, which lists the tasks; {DOWNLOAD_AGAIN}")
     for table in ([TASKS], [EPISODES, "*/*.parquet"], ["data", "*/*.parquet"]):
         _check_readable(root.glob("/".join(table)))
+    check_paths(root, info)
     _check_episodes(root, info["total_episodes"])
     if (root / STATISTICS).exists():
         with reading(root / STATISTICS, f"delete it, and {NO_STATISTICS}"):

@@ -5,12 +5,13 @@ names that must be known already, and the page's own three files are read before
 """
 
 import hmac
+import ipaddress
 import json
+import re
 import secrets
 import socket
 import struct
 from pathlib import Path
-from urllib.parse import urlsplit
 
 import uvicorn
 from starlette.applications import Starlette
@@ -76,10 +77,10 @@ class Guard:
         host, origin = request.headers.get("host", ""), request.headers.get("origin")
         if _host_name(host) not in self.hosts:
             return PlainTextResponse("wrong host", 403)
-        given = request.url.path.split("/")[1]
+        given = request.scope["path"].removeprefix("/").partition("/")[0]  # "*" is a path, too
         if not hmac.compare_digest(given.encode(errors="replace"), self.token.encode()):
             return PlainTextResponse("open the address that latentsafe label printed", 403)
-        if origin is not None and urlsplit(origin).netloc != host:
+        if origin is not None and origin.partition("://")[2] != host:
             return PlainTextResponse("wrong origin", 403)
         if request.method not in ("GET", "HEAD"):
             if origin is None or request.headers.get("sec-fetch-site", "same-origin") != "same-origin":
@@ -89,11 +90,13 @@ class Guard:
         return None
 
 
+HOST = re.compile(r"(?:\[([0-9a-f:.%]+)\]|([0-9a-z.-]+))(?::\d{1,5})?")
+"""A host, and perhaps a port, as a browser writes them."""
+
+
 def _host_name(host: str) -> str:
-    try:
-        return urlsplit(f"//{host}").hostname or ""
-    except ValueError:
-        return ""
+    found = HOST.fullmatch(host.lower())
+    return (found[1] or found[2]) if found else ""
 
 
 class LabelServer:
@@ -256,22 +259,46 @@ def _refuse(status: int):
     return lambda request, error: JSONResponse({"error": str(error)}, status)
 
 
-def listen(host: str, port: int) -> socket.socket:
-    """A bound socket.
+def address_of(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
+    """The one address that a host stands for: one of this machine's own loopback, or one that is spelled out.
 
     Raises:
-        OSError: the port is in use or the address is not this machine's.
-        ValueError: an address that names no interface.
+        OSError: the name is not known.
+        ValueError: all interfaces, however they are spelled, or a name or spelling of an address beyond loopback.
     """
-    if host in ("", "0.0.0.0", "::"):
+    try:
+        resolved = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0][4][0] if host else "::"
+    except (OSError, UnicodeError) as e:
+        raise OSError(
+            f"cannot listen on {host!r} ({e}); keep --host=127.0.0.1, or give an address of this machine"
+        ) from e
+    address = ipaddress.ip_address(resolved)
+    address = getattr(address, "ipv4_mapped", None) or address
+    if address.is_unspecified or address.is_multicast:
         raise ValueError(
             f"--host={host} would take calls under any name; keep 127.0.0.1 and use an SSH tunnel, or give the one "
             "address by which your browser reaches this machine"
         )
-    listener = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
+    if not address.is_loopback and str(address) != host.lower():
+        raise ValueError(
+            f"--host={host} stands for {address}, which others can reach; keep 127.0.0.1 and use an SSH tunnel, or "
+            f"give --host={address} if you mean it"
+        )
+    return address
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A bound socket, on exactly the address that `address_of` finds.
+
+    Raises:
+        OSError: the port is in use or the address is not this machine's.
+        ValueError: an address that names no interface, or more than it says.
+    """
+    address = address_of(host)
+    listener = socket.socket(socket.AF_INET6 if address.version == 6 else socket.AF_INET)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        listener.bind((host, port))
+        listener.bind((str(address), port))
         listener.listen()
     except (OSError, OverflowError) as e:
         listener.close()
@@ -286,5 +313,6 @@ def serve(server: LabelServer, listener: socket.socket) -> None:
     print(f"Label at http://{shown}:{port}/{token}/ (every key is saved; Ctrl-C stops)", flush=True)
     loopback = {"127.0.0.1", "localhost", "::1"}
     hosts = loopback if host in loopback else {host}
-    config = uvicorn.Config(server.app(token, hosts), log_level="warning", access_log=False, server_header=False)
+    app = server.app(token, hosts)
+    config = uvicorn.Config(app, log_level="warning", access_log=False, server_header=False, ws="none")
     uvicorn.Server(config).run(sockets=[listener])
