@@ -124,16 +124,16 @@ class CheckLabels:
         """Write the page, and print the worst."""
         model, frames = load_filter(self.policy.path).model, self.dataset.frames()
         store = LabelStore(frames.root, frames.meta.repo_id, [self.specification])
-        margins, without = {}, {}
-        for episode, margin in episode_margins(model, frames):
-            (without if isinstance(margin, str) else margins)[episode] = margin
+        judged = dict(episode_margins(model, frames))
+        margins = {episode: margin for episode, margin in judged.items() if not isinstance(margin, str)}
         found = find_disagreements(store, self.specification, margins)
         for d in found[:20]:
             label = in_words(store.verdict(self.specification, d.episode).first, len(d.margin))
             print(f"episode {d.episode:5d}  {d.degree:.2f}  labelled: {label}")
         write_disagreements(self.output, found, store, frames, self.specification)
-        for episode, why in [*without.items()][:SHOWN]:
-            print(f"episode {episode} was not judged, because {why}")
+        without = [episode for episode in judged if episode not in margins]
+        for episode in without[:SHOWN]:
+            print(f"episode {episode} was not judged, because {judged[episode]}")
         print(f"{len(found)} disagreements; {len(without)} episodes were not judged; open {self.output}")
 
 
