@@ -28,10 +28,11 @@ from lerobot_latentsafe.cli import evaluate, label, train  # noqa: F401  (loaded
 from lerobot_latentsafe.collection import dubins, franka, so101
 from lerobot_latentsafe.experiments.blocks import dreamer_training  # noqa: F401
 from lerobot_latentsafe.franka.scenes import SCENES
+from lerobot_latentsafe.labeling.store import LabelStore
 
 LONGEST_S = 600
 """A run that takes longer hangs."""
-CAR, MODEL, FILTER = "car", "world_model", "filter"
+CAR, DEMONSTRATIONS, MODEL, FILTER = "car", "demonstrations", "world_model", "filter"
 """Folders of what the verbs start from."""
 SMALL = {"type": "rssm", "deterministic": 16, "stochastic": 4, "hidden": 16, "units": 16, "clip_length": 6}
 SIZES = [f"world_model.{name}={value}" for name, value in SMALL.items()]
@@ -48,11 +49,13 @@ class Verb:
         typed: verb and options.
         product: what it leaves in `{out}`.
         again: what is typed after a kill, given `{out}`; None: the same.
+        within: a dataset of `{made}` that it writes into, of which each run has a copy in `{out}/out`.
     """
 
     typed: str
     product: str = "out"
     again: Callable[[Path], list[str]] | None = None
+    within: str | None = None
 
 
 def data(name: str) -> str:
@@ -91,7 +94,7 @@ def _resumed_training(out: Path) -> list[str]:
 
 
 VERBS = {
-    "collect, car": Verb(f"{COLLECT} --source=random --dataset.num_episodes=12"),
+    "collect, car": Verb(f"{COLLECT} --source=random --dataset.num_episodes=9"),
     "collect, Franka": Verb(f"{COLLECT} --source=blocks_demos --dataset.num_episodes=4"),
     "collect, SO-101": Verb(f"{COLLECT} --source=so101_mix --dataset.num_episodes=4"),
     "cache": Verb(f"cache {data(CAR)} --image_size=64 --output_dir={{out}}/out"),
@@ -103,11 +106,16 @@ VERBS = {
     "train-dreamer": Verb(DREAMER),
     "calibrate": Verb(f"calibrate --policy.path={{made}}/{FILTER} {data('car_cache')} --output_dir={{out}}/out"),
     "report": Verb(
-        f"report --policy.path={{made}}/{FILTER} --env.type=latentsafe_dubins --env.episode_length=20 --n_episodes=3 "
+        f"report --policy.path={{made}}/{FILTER} --env.type=latentsafe_dubins --env.episode_length=8 --n_episodes=2 "
         "--base_policy_path=dubins_diffusion_reckless --output={out}/out/report.html"
     ),
+    "auto-label": Verb(
+        f"auto-label --dataset.repo_id=me/{DEMONSTRATIONS} --dataset.root={{out}}/out --labeller=dubins_truth "
+        "--specification=crashed",
+        within=DEMONSTRATIONS,
+    ),
     "write-labels": Verb(
-        f"write-labels {data(CAR)} --specifications=[failure] --new_repo_id=me/labelled --output_dir={{out}}/out"
+        f"write-labels {data(CAR)} --specifications=[crashed] --new_repo_id=me/labelled --output_dir={{out}}/out"
     ),
 }
 
@@ -197,7 +205,8 @@ def left_by(folder: Path) -> dict[str, object]:
 
 def _content(path: Path) -> object:
     if path.suffix == ".parquet":
-        return pq.read_table(path).to_pydict()
+        table = pq.read_table(path)
+        return table.drop_columns([name for name in table.column_names if name == "labelled_at"]).to_pydict()
     if path.suffix == ".safetensors":
         return {name: (str(t.dtype), t.shape, t.reshape(-1).view(torch.uint8).numpy().tobytes())
                 for name, t in load_file(path).items()}  # fmt: skip
@@ -225,11 +234,17 @@ def make(made: Path) -> None:
     places = {"made": made, "out": made}
     for words in (
         f"collect --source=random --dataset.repo_id=me/{CAR} --dataset.root={{made}}/{CAR} --dataset.num_episodes=24",
+        f"collect --source=reckless --dataset.repo_id=me/{DEMONSTRATIONS} --dataset.root={{made}}/{DEMONSTRATIONS} "
+        "--dataset.num_episodes=24",
         f"cache {data(CAR)} --output_dir={{made}}/car_cache",
         f"{TRAIN} --steps=4 --save_freq=4",
     ):
         finished(words.format(**places).split(), made / "log.txt")
     shutil.copytree(made / "out" / "checkpoints" / "last" / "pretrained_model", made / MODEL)
+    store = LabelStore(made / CAR, f"me/{CAR}", ["crashed"])
+    for episode in range(len(store)):
+        store.label("crashed", episode, episode % 5, "somebody")
+    store.close()
     words = f"train-reachability --policy.path={{made}}/{MODEL} {data('car_cache')} --output_dir={{made}}/{FILTER}"
     finished(words.format(**places).split(), made / "log.txt")
 
@@ -241,13 +256,12 @@ def kills(verb: Verb, made: Path, folder: Path, n: int, rng: np.random.Generator
         seconds of an undisturbed run, kills that came in time, runs that ended as that one, and what differs or was
         said in the others.
     """
-    whole, log = folder / "whole", folder / "log.txt"
-    whole.mkdir(parents=True)
+    log = folder / "log.txt"
+    whole = _begun(verb, made, folder / "whole")
     seconds = finished(_typed(verb, made, whole), log)
     expected, equal, in_time, wrong = left_by(whole / verb.product), 0, 0, []
     for trial in range(n):
-        out = folder / f"killed_{trial}"
-        out.mkdir()
+        out = _begun(verb, made, folder / f"killed_{trial}")
         moment = rng.uniform(0.05, 0.95) * seconds
         in_time += ended(start(_typed(verb, made, out), log), moment) is None
         words = (verb.again(out) if verb.again else []) or _typed(verb, made, out)
@@ -261,6 +275,14 @@ def kills(verb: Verb, made: Path, folder: Path, n: int, rng: np.random.Generator
             wrong.append({"at_s": moment, "status": status, "differs": found[:5], "left": _left_over(out),
                           "said": log.read_text()[-300:]})  # fmt: skip
     return {"seconds": round(seconds, 2), "kills": n, "in_time": in_time, "equal": equal, "wrong": wrong}
+
+
+def _begun(verb: Verb, made: Path, out: Path) -> Path:
+    """The folder of a new run."""
+    out.mkdir(parents=True)
+    if verb.within:
+        shutil.copytree(made / verb.within, out / "out")
+    return out
 
 
 def _typed(verb: Verb, made: Path, out: Path) -> list[str]:
