@@ -23,8 +23,6 @@ import torch
 from lerobot.scripts import lerobot_train
 from safetensors.torch import load_file
 
-from lerobot_latentsafe import cli
-from lerobot_latentsafe.cli import evaluate, label, train  # noqa: F401  (loaded before anything is forked)
 from lerobot_latentsafe.collection import dubins, franka, so101
 from lerobot_latentsafe.experiments.blocks import dreamer_training  # noqa: F401
 from lerobot_latentsafe.franka.scenes import SCENES
@@ -39,6 +37,8 @@ SIZES = [f"world_model.{name}={value}" for name, value in SMALL.items()]
 SIZES += ["margin.clips=64", "reachability.critic_hidden=[16]", "reachability.actor_hidden=[16]"]
 SIZES += ["reachability.steps=60", "reachability.pool=512", "reachability.horizon=4", "reachability.batch_size=32"]
 SIZES += ["reachability.refresh=10"]
+Run = Callable[[list[str]], None]
+"""The command `latentsafe`, given what is typed after it."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ def shrink() -> None:
     torch.randn_like = torch.zeros_like
 
 
-def start(words: list[str], log: Path) -> int:
+def start(words: list[str], log: Path, run: Run) -> int:
     """The number of a new process, leader of its group, that runs a command."""
     process = os.fork()
     if process:
@@ -146,7 +146,11 @@ def start(words: list[str], log: Path) -> int:
         os.dup2(descriptor, 1)
         os.dup2(descriptor, 2)
         shrink()
-        _command(words)
+        if words[0] == "lerobot-train":
+            sys.argv = words
+            lerobot_train.main()
+        else:
+            run(words)
         status = 0
     except SystemExit as e:
         print(e, file=sys.stderr)
@@ -157,14 +161,6 @@ def start(words: list[str], log: Path) -> int:
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(status)
-
-
-def _command(words: list[str]) -> None:
-    if words[0] == "lerobot-train":
-        sys.argv = words
-        lerobot_train.main()
-    else:
-        cli.main(words)
 
 
 def ended(process: int, within_s: float) -> int | None:
@@ -181,14 +177,14 @@ def ended(process: int, within_s: float) -> int | None:
     return None
 
 
-def finished(words: list[str], log: Path) -> float:
+def finished(words: list[str], log: Path, run: Run) -> float:
     """Run a command to its end; the seconds that it took.
 
     Raises:
         RuntimeError: it failed, with what it said.
     """
     began = time.monotonic()
-    status = ended(start(words, log), LONGEST_S)
+    status = ended(start(words, log, run), LONGEST_S)
     if status != 0:
         raise RuntimeError(f"{' '.join(words)}: status {status}: {log.read_text()[-2000:]}")
     return time.monotonic() - began
@@ -228,7 +224,7 @@ def differences(one: dict[str, object], other: dict[str, object]) -> list[str]:
 # -- the measurement ---
 
 
-def make(made: Path) -> None:
+def make(made: Path, run: Run) -> None:
     """What the verbs start from: a dataset with labels, its cache, a world model, a filter and a policy."""
     made.mkdir(parents=True)
     places = {"made": made, "out": made}
@@ -239,17 +235,17 @@ def make(made: Path) -> None:
         f"cache {data(CAR)} --output_dir={{made}}/car_cache",
         f"{TRAIN} --steps=4 --save_freq=4",
     ):
-        finished(words.format(**places).split(), made / "log.txt")
+        finished(words.format(**places).split(), made / "log.txt", run)
     shutil.copytree(made / "out" / "checkpoints" / "last" / "pretrained_model", made / MODEL)
     store = LabelStore(made / CAR, f"me/{CAR}", ["crashed"])
     for episode in range(len(store)):
         store.label("crashed", episode, episode % 5, "somebody")
     store.close()
     words = f"train-reachability --policy.path={{made}}/{MODEL} {data('car_cache')} --output_dir={{made}}/{FILTER}"
-    finished(words.format(**places).split(), made / "log.txt")
+    finished(words.format(**places).split(), made / "log.txt", run)
 
 
-def kills(verb: Verb, made: Path, folder: Path, n: int, rng: np.random.Generator) -> dict:
+def kills(verb: Verb, made: Path, folder: Path, n: int, rng: np.random.Generator, run: Run) -> dict:
     """Kill a verb n times at a random moment of its course, start it again each time, and compare.
 
     Returns:
@@ -258,14 +254,14 @@ def kills(verb: Verb, made: Path, folder: Path, n: int, rng: np.random.Generator
     """
     log = folder / "log.txt"
     whole = _begun(verb, made, folder / "whole")
-    seconds = finished(_typed(verb, made, whole), log)
+    seconds = finished(_typed(verb, made, whole), log, run)
     expected, equal, in_time, wrong = left_by(whole / verb.product), 0, 0, []
     for trial in range(n):
         out = _begun(verb, made, folder / f"killed_{trial}")
         moment = rng.uniform(0.05, 0.95) * seconds
-        in_time += ended(start(_typed(verb, made, out), log), moment) is None
+        in_time += ended(start(_typed(verb, made, out), log, run), moment) is None
         words = (verb.again(out) if verb.again else []) or _typed(verb, made, out)
-        status = ended(start(words, log), LONGEST_S)
+        status = ended(start(words, log, run), LONGEST_S)
         found = differences(left_by(out / verb.product), expected)
         # A run that had come to its end is told that it has.
         if not found and (status == 0 or "exists already" in log.read_text()) and not _left_over(out):
@@ -294,12 +290,12 @@ def _left_over(out: Path) -> list[str]:
     return sorted(p.name for p in out.iterdir() if p.name != "out")
 
 
-def kill_verbs(folder: Path, names: list[str], n: int, seed: int) -> dict[str, dict]:
+def kill_verbs(folder: Path, names: list[str], n: int, seed: int, run: Run) -> dict[str, dict]:
     """The table: verb -> see `kills`; what is done already is read from a file, so that this goes on after a kill."""
     made, rows = folder / "made", {}
     if not (made / "done").exists():
         shutil.rmtree(made, ignore_errors=True)
-        make(made)
+        make(made, run)
         (made / "done").touch()
     for name in names:
         note = folder / f"{re.sub('[^a-z0-9]+', '_', name.lower())}.json"
@@ -307,7 +303,7 @@ def kill_verbs(folder: Path, names: list[str], n: int, seed: int) -> dict[str, d
             work = folder / note.stem
             shutil.rmtree(work, ignore_errors=True)
             rng = np.random.default_rng([seed, *name.encode()])
-            note.write_text(json.dumps(kills(VERBS[name], made, work, n, rng)))
+            note.write_text(json.dumps(kills(VERBS[name], made, work, n, rng, run)))
         rows[name] = json.loads(note.read_text())
         print(name, {key: value for key, value in rows[name].items() if key != "wrong"}, flush=True)
     return rows
