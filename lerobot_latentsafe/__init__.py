@@ -7,6 +7,7 @@ LeRobot's registries, and loads nothing heavy. What a notebook needs is imported
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from lerobot_latentsafe.chunk_guard import ChunkGuardStep
 from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
 from lerobot_latentsafe.decision import LawOptions
 from lerobot_latentsafe.envs.configuration_envs import (
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
     )
 
 __all__ = [
+    "ChunkGuardStep",
     "EpisodeValues",
     "FilterDecision",
     "GraspPredictionStep",

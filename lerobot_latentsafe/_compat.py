@@ -1,13 +1,11 @@
 """Every place that leans on the insides of LeRobot 0.6: look here first when a new version breaks something."""
 
 import logging
-import re
 import sys
 from collections import deque
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
-import numpy as np
 import pyarrow.parquet as pq
 from lerobot.utils.constants import ACTION
 from lerobot.utils.import_utils import require_package
@@ -16,15 +14,25 @@ from torch import Tensor
 if TYPE_CHECKING:
     from lerobot.configs.policies import PreTrainedConfig
     from lerobot.configs.train import TrainPipelineConfig
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from lerobot.datasets.dataset_writer import DatasetWriter
     from lerobot.policies.pretrained import PreTrainedPolicy
 
-RECORDING = re.compile(r"Recording episode (\d+)$")
-"""What LeRobot's loops log when an episode begins."""
-RESETTING = "Reset the environment"
-"""What they log between episodes."""
-RETURNING = "Returning robot to initial position"
-"""What they log before they move the robot back."""
+RECORDING = {
+    ("lerobot.scripts.lerobot_record", "record_loop"): ("dataset", "start_episode_t"),
+    ("lerobot.rollout.strategies.episodic", "_policy_loop"): ("dataset", "start_t"),
+}
+"""LeRobot's loops that record an episode, or nothing if their dataset is None -> names of it and of when they began."""
+BETWEEN = {
+    ("lerobot.rollout.strategies.episodic", "_reset_loop"),
+    ("lerobot.rollout.strategies.episodic", "run"),
+    ("lerobot.rollout.strategies.core", "_return_to_initial_position"),
+}
+"""Those that move a robot between episodes."""
+
+EVALUATION = "lerobot.scripts.lerobot_eval"
+"""LeRobot's evaluation in simulation, which begins each episode by `policy.reset()`."""
+ROLLOUT = "lerobot.rollout"
+"""LeRobot's loops that run a policy on a robot; they do the same."""
 
 ADAPTER = "adapter_config.json"
 """The file beside a policy's config.json that makes it a PEFT adapter."""
@@ -49,6 +57,44 @@ def training_run() -> "TrainPipelineConfig | None":
     return None
 
 
+def called_from(module: str) -> bool:
+    """Whether a module of LeRobot, or one in a package of it, is at work just now."""
+    frame = sys._getframe(1)
+    while frame is not None:
+        name = frame.f_globals.get("__name__", "")
+        if name == module or name.startswith(f"{module}."):
+            return True
+        frame = frame.f_back
+    return False
+
+
+class Loop(NamedTuple):
+    """A loop of LeRobot's that drives a robot.
+
+    Attributes:
+        episode: the number of the one that it records; None between episodes.
+        began: when, by LeRobot's clock; it tells two loops that record the same episode.
+    """
+
+    episode: int | None
+    began: float | None
+
+
+def calling_loop() -> Loop | None:
+    """The loop that records, or moves a robot between episodes, if one of them is calling: LeRobot tells no robot."""
+    frame = sys._getframe(1)
+    while frame is not None:
+        spec = frame.f_globals.get("__spec__")  # its name is the module's even if that is run as a program
+        place = getattr(spec, "name", None) or frame.f_globals.get("__name__"), frame.f_code.co_name
+        if place in RECORDING:
+            dataset, began = (frame.f_locals.get(name) for name in RECORDING[place])
+            return Loop(None if dataset is None else dataset.num_episodes, began)
+        if place in BETWEEN:
+            return Loop(None, None)
+        frame = frame.f_back
+    return None
+
+
 def drop_episode_statistics(root: Path, features: list[str]) -> None:
     """Remove what a dataset's episodes still say of features that `remove_feature` took out.
 
@@ -60,9 +106,37 @@ def drop_episode_statistics(root: Path, features: list[str]) -> None:
         pq.write_table(table.drop_columns([c for c in table.column_names if c.startswith(left_over)]), file)
 
 
-def last_added(dataset: "LeRobotDataset", feature: str) -> np.ndarray:
-    """What a dataset that is being recorded holds of the frame that was added last."""
-    return dataset.writer.episode_buffer[feature][-1]
+WRITER = "lerobot.datasets.lerobot_dataset.DatasetWriter"
+"""The class by which a dataset that is being recorded writes."""
+
+
+def episode_to_write(writer: "DatasetWriter") -> dict:
+    """The episode that is being recorded: feature -> its frames, `episode_index`, and `size`, which counts frames."""
+    if writer.episode_buffer is None:
+        writer.episode_buffer = writer._create_episode_buffer()
+    return writer.episode_buffer
+
+
+def write_into(writer: "DatasetWriter", folder: Path) -> None:
+    """Have a dataset's writer write into another folder than its dataset's, pictures and metadata included."""
+    writer._root = writer._meta.root = folder
+
+
+def close_files(writer: "DatasetWriter") -> None:
+    """Make the episode that was just saved readable; the next one begins files of its own, as if recording went on.
+
+    LeRobot keeps its tables open, and its metadata in memory, until the last episode.
+    """
+    meta = writer._meta
+    writer.close_writer()
+    meta._close_writer()
+    meta.episodes = [{name: value for name, (value,) in meta.latest_episode.items()}]
+    meta.latest_episode = writer._latest_episode = None
+
+
+def read_anew(writer: "DatasetWriter") -> None:
+    """Have a dataset that was recorded read its metadata from its folder."""
+    writer._meta.episodes = None
 
 
 def is_lerobots(policy: "PreTrainedPolicy") -> bool:

@@ -2,7 +2,7 @@
 
 import copy
 from collections import deque
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, wait
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -17,6 +17,7 @@ from lerobot_latentsafe._compat import (
     queued_actions,
     set_observation_queues,
 )
+from lerobot_latentsafe.runtime.time_limit import Worker
 
 if TYPE_CHECKING:
     from lerobot.policies.pretrained import PreTrainedPolicy
@@ -27,7 +28,7 @@ class ChunksAhead:
 
     A chunk starts at the tick whose observation it was begun on: actions whose time is past when it is taken up are
     left out, and as many later ones played for them, where the policy plans further than it plays. If it is not ready
-    by then, the control thread waits for it.
+    by then, whoever asks for an action waits for it; see `LatentSafePolicy` for how long.
 
     Args:
         policy: one that plays its chunks from a queue of actions, such as LeRobot's diffusion policy or ACT.
@@ -69,6 +70,11 @@ class ChunksAhead:
         self._playing: deque[Tensor] = deque()
         self._next: Future[Tensor] | None = None
         self._ticks = 0
+
+    @property
+    def playing(self) -> deque[Tensor]:
+        """What is still to come of the chunk that is played: (B, A) each, in the policy's own units."""
+        return self._playing
 
     def act(self, batch: dict[str, Tensor]) -> Tensor:
         """The next action (B, A) of the policy's own units, given what it sees now."""
@@ -119,5 +125,5 @@ class ChunksAhead:
         return chunk
 
 
-def _worker() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(1, thread_name_prefix="chunks")
+def _worker() -> Worker:
+    return Worker("chunks")

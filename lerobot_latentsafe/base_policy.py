@@ -4,6 +4,7 @@ import logging
 from collections.abc import Sequence
 from pathlib import Path
 
+import torch
 from lerobot.configs.parser import parse_arg
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class
@@ -14,7 +15,7 @@ from lerobot.utils.import_utils import require_package
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from lerobot_latentsafe._compat import ADAPTER, forget_plan, is_lerobots, merged_adapter
+from lerobot_latentsafe._compat import ADAPTER, forget_plan, is_lerobots, merged_adapter, queued_actions
 from lerobot_latentsafe.action_chunks import ChunksAhead
 from lerobot_latentsafe.origin import Origin, inverse, order
 from lerobot_latentsafe.runtime.checkpoint import (
@@ -44,6 +45,10 @@ class BasePolicy:
         ahead: if not 0, its chunks are made off the control thread; see `ChunksAhead`.
         origin: what is known of the data it was trained on; by default what its configuration says.
 
+    Attributes:
+        planned: (B, N, A) in robot units, what comes after the action that was proposed last, of a chunk that was
+            planned just then and can be read; else None.
+
     Raises:
         ValueError: it is itself a filter, or cannot choose one action at a time.
     """
@@ -60,6 +65,8 @@ class BasePolicy:
         self._state_order: list[int] | None = None
         self._action_order: list[int] | None = None
         self._said_reset = False
+        self._reads_plans = True
+        self.planned: Tensor | None = None
 
     @classmethod
     def load(cls, path: str | Path, device: str = "cpu", ahead: int = 0) -> "BasePolicy":
@@ -99,15 +106,40 @@ class BasePolicy:
             self.chunks.reset()
         self.preprocessor.reset()
         self.postprocessor.reset()
+        self.planned = None
 
     def propose(self, observation: dict[str, Tensor]) -> Tensor:
-        """Action (B, A) in robot units, through the base policy's own processors."""
+        """Action (B, A) in robot units, through the base policy's own processors; see `planned` for what comes then."""
         observation = dict(observation)
         if self._state_order is not None:
             observation[OBS_STATE] = observation[OBS_STATE][:, self._state_order]
         act = self.policy.select_action if self.chunks is None else self.chunks.act
-        action = self.postprocessor(act(self.preprocessor(observation)))
-        return action if self._action_order is None else action[:, self._action_order]
+        queue = self._queue()
+        left = len(queue or ())
+        action = self._finished(act(self.preprocessor(observation)))
+        queue = self._queue()
+        self.planned = self._read(queue) if queue and len(queue) >= left else None
+        return action
+
+    def _finished(self, action: Tensor) -> Tensor:
+        """Actions (..., A) of the policy's own units in robot units, in the filter's order."""
+        action = self.postprocessor(action)
+        return action if self._action_order is None else action[..., self._action_order]
+
+    def _queue(self) -> Sequence[Tensor] | None:
+        """What is to come of a chunk that is played, (B, A) each in the policy's own units, if that can be read."""
+        if not self._reads_plans:
+            return None
+        return queued_actions(self.policy) if self.chunks is None else self.chunks.playing
+
+    def _read(self, queue: Sequence[Tensor]) -> Tensor | None:
+        """What is to come, in robot units (B, N, A); None of a policy whose processors take one action at a time."""
+        try:
+            return self._finished(torch.stack([*queue], 1))
+        except Exception as e:
+            self._reads_plans = False
+            logger.warning("chunks of the base policy (%s) cannot be read: %s", self.config.type, e)
+            return None
 
     def replan(self, executed: Tensor) -> None:
         """Drop the rest of a planned chunk: after an intervention it belongs to a state that never came.

@@ -13,6 +13,7 @@ from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
 from lerobot_latentsafe.datasets.clips import ClipReader
 from lerobot_latentsafe.datasets.labels import FAILING
 from lerobot_latentsafe.latent import map_latent
+from lerobot_latentsafe.runtime.options import require_at_least
 from lerobot_latentsafe.safety_model import SafetyModel
 
 
@@ -56,8 +57,10 @@ def calibrate(rows: list[dict[str, np.ndarray]], max_missed: float = 0.05, lead_
             warned about and count.
 
     Raises:
-        ValueError: no failing or no safe episode among them.
+        ValueError: no failing or no safe episode among them, V that is not finite, or options that mean nothing.
     """
+    check_options(max_missed, lead_steps)
+    _require_finite(rows)
     best_before, safe = [], []
     for row in rows:
         failing = np.flatnonzero(row["failure"] == FAILING)
@@ -83,6 +86,27 @@ def calibrate(rows: list[dict[str, np.ndarray]], max_missed: float = 0.05, lead_
         failing_episodes=len(reached),
         safe_frames=len(quiet),
     )
+
+
+def check_options(max_missed: float, lead_steps: int) -> None:
+    """Refuse a share that is none or all, and a warning that comes with the failure or after it.
+
+    Raises:
+        ValueError: naming the option.
+    """
+    if not 0 <= max_missed < 1:
+        raise ValueError(f"--max_missed is {max_missed}; expected a share from 0 to below 1")
+    require_at_least("--lead_steps", lead_steps, 1)
+
+
+def _require_finite(rows: list[dict[str, np.ndarray]]) -> None:
+    """Refuse to count as a warning, or as none, what says nothing."""
+    broken = [row for row in rows if not np.isfinite(row["value"]).all()]
+    if broken:
+        raise ValueError(
+            f"V is not finite in {len(broken)} of {len(rows)} held-out episodes, so nothing tells when this filter "
+            "warns; check the data with latentsafe check-dataset, and train the filter again"
+        )
 
 
 def store(config: LatentSafeConfig, calibration: Calibration) -> None:

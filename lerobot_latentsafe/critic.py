@@ -139,6 +139,10 @@ class ReachabilityConfig:
             raise ValueError(f"actor_through is {self.actor_through!r}; expected critic or world_model")
 
 
+LARGEST_Q = 10.0
+"""V lies in [-1, 1]; a Q that is larger than this was never learned."""
+
+
 def _mlp(sizes: list[int], activation: str) -> nn.Sequential:
     layers: list[nn.Module] = []
     for i, (n_in, n_out) in enumerate(pairwise(sizes)):
@@ -235,8 +239,12 @@ class SafetyCritic(nn.Module):
         return self.between(torch.sigmoid(2 * self.actor(x)))
 
     def value(self, features: Tensor, margin: Tensor) -> Tensor:
-        """V = min(l, max_a Q) at raw features (..., D) with bounded margin (...,); a risk's is -1 where l < 0."""
-        return self.backup(margin, self.best_q(self.project(features)), 1.0)
+        """V = min(l, max_a Q) at raw features (..., D) with bounded margin (...,); a risk's is -1 where l < 0.
+
+        NaN where Q is absurd: a minimum would hide that.
+        """
+        q = self.best_q(self.project(features))
+        return self.backup(margin, torch.where(q.abs() <= LARGEST_Q, q, torch.nan), 1.0)
 
     def fallback(self, features: Tensor) -> Tensor:
         """Safety-preserving action in [-1, 1] at raw features: (..., D) -> (..., A)."""

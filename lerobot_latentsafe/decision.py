@@ -1,12 +1,13 @@
 """Filter laws: given a value, decide whether a proposed action passes. Pure and batched."""
 
+import math
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
 
 import torch
 from torch import Tensor
 
-LAWS = ("reachability", "risk", "plan", "margin")
+LAWS = ("reachability", "risk", "plan", "margin", "guard")
 MODES = ("filter", "monitor")
 RECENT = 10
 """Steps whose overrides count for `retreat_after`."""
@@ -28,6 +29,10 @@ class Reason(IntEnum):
     NO_BASE_POLICY = 10
     WRONG_RATE = 11
     OBSERVATION_OUT_OF_RANGE = 12
+    OBSERVATION_MALFORMED = 13
+    OBSERVATION_UNFAMILIAR = 14
+    ACTION_JUMPS = 15
+    FILTER_FAILED = 16
 
 
 @dataclass
@@ -35,7 +40,7 @@ class LawOptions:
     """Changes of a filter's law; what is not given stays as it is. See `LawConfig`."""
 
     name: str | None = None
-    """reachability, risk, plan or margin."""
+    """reachability, risk, plan, margin or guard."""
     epsilon: float | None = None
     """The fallback acts where V is at or below this threshold."""
     resume_above: float | None = None
@@ -55,7 +60,9 @@ class LawOptions:
     min_retreat_steps: int | None = None
     """Steps for which a retreat goes on at least."""
     deadline_ms: float | None = None
-    """A decision that took longer than this is not trusted: the fallback acts."""
+    """A decision that took longer than this is not trusted, be the observation fresh or not."""
+    slack_ms: float | None = None
+    """By so much an observation may be older than a period when the action leaves."""
     mode: str | None = None
     """filter, or monitor, which never acts and reports what it would have done."""
 
@@ -66,7 +73,8 @@ class LawConfig:
 
     Attributes:
         name: what V is: `reachability`; or a baseline: `risk`, which needs a critic trained for it, `plan`, which
-            imagines holding each action, and `margin`, which reads l alone and stands still.
+            imagines holding each action, and `margin`, which reads l alone and stands still. `guard` has no V: it
+            checks ranges, cameras and times alone, and stays where something is wrong.
         epsilon: the fallback acts where V of the predicted next latent is at or below this threshold. A risk critic's V
             is -risk, so SQRL's threshold of 0.1 is an epsilon of -0.1.
         resume_above: once the fallback has acted, the base policy acts again only where V is above this, if that is
@@ -84,7 +92,9 @@ class LawConfig:
             same for waiting at a doubtful place as for leaving it, so the critic may wait.
         retreat_after: overrides in the last ten steps after which the next override is the retreat's.
         min_retreat_steps: steps for which a retreat goes on at least: a single step leads nowhere.
-        deadline_ms: if set, a decision that took longer is not trusted, and the fallback acts.
+        deadline_ms: if set, a decision that took longer is not trusted, be the observation fresh or not.
+        slack_ms: by so much an observation may be older than a period of the data's rate when the action leaves.
+            Beyond that nothing passes.
         mode: `filter` overrides unsafe actions; `monitor` only reports what it would have done.
     """
 
@@ -99,6 +109,7 @@ class LawConfig:
     retreat_after: int = 0
     min_retreat_steps: int = 1
     deadline_ms: float | None = None
+    slack_ms: float = 0.0
     mode: str = "filter"
 
     def __post_init__(self) -> None:
@@ -112,6 +123,9 @@ class LawConfig:
             "history_frames": (self.history_frames == 0 or self.history_frames >= 2, "0 (all) or at least 2 frames"),
             "resume_above": (self.resume_above < 1, "less than 1, which V never exceeds"),
             "samples": (self.samples >= 0, "0 (mean or mode) or a number of draws"),
+            "epsilon": (not math.isnan(self.epsilon), "a number; V is between -1 and 1"),
+            "deadline_ms": (self.deadline_ms is None or self.deadline_ms > 0, "milliseconds, or none"),
+            "slack_ms": (0 <= self.slack_ms < math.inf, "milliseconds, 0 or more"),
         }  # fmt: skip
         for name, (fits, what) in expected.items():
             if not fits:
@@ -131,12 +145,25 @@ class LawConfig:
         given = {f.name: value for f in fields(options) if (value := getattr(options, f.name)) is not None}
         return replace(self, **given)
 
+    @property
+    def disarmed(self) -> str | None:
+        """In words, if what the filter does has nothing to do with what it sees, by these settings."""
+        if self.mode == "monitor":
+            return "it is a monitor, which reports and never acts"
+        if self.name != "guard" and self.epsilon <= -1:
+            return f"epsilon is {self.epsilon:g}, and V is never that low: no value makes it act"
+        if self.name != "guard" and self.epsilon >= 1:
+            return f"epsilon is {self.epsilon:g}, and V is never above that: it always acts"
+        return None
+
     def passes_nothing_more_than(self, other: "LawConfig") -> bool:
         """Whether every action that passes under this law passes under the other, too, which decides on the same V."""
         ordered = ("epsilon", "resume_above", "min_retreat_steps")
         stricter = all(getattr(self, name) >= getattr(other, name) for name in ordered)
         in_time = other.deadline_ms is None or (self.deadline_ms is not None and self.deadline_ms <= other.deadline_ms)
-        alike = replace(self, **{name: getattr(other, name) for name in (*ordered, "deadline_ms", "mode")}) == other
+        in_time &= self.slack_ms <= other.slack_ms
+        times = ("deadline_ms", "slack_ms")
+        alike = replace(self, **{name: getattr(other, name) for name in (*ordered, *times, "mode")}) == other
         return self.mode == "filter" and alike and stricter and in_time
 
 
@@ -195,6 +222,20 @@ def least_restrictive(
     passing = proposed if monitor or passing is None else passing
     action = torch.where(intervened[:, None], fallback, passing)
     return FilterDecision(action, proposed, value, margin, unsafe, intervened, reason)
+
+
+def by_checks_alone(
+    proposed: Tensor, hold: Tensor, fault: Tensor, monitor: bool = False, passing: Tensor | None = None
+) -> FilterDecision:
+    """The law of a guard: pass what has no fault, else stay. Nothing is known of V and l, which are NaN.
+
+    Args:
+        proposed, hold, passing: (B, A) in robot units, see `least_restrictive`.
+        fault: (B,), a `Reason`.
+    """
+    harmless = torch.ones_like(fault, dtype=torch.float32)
+    decision = least_restrictive(proposed, hold, harmless, harmless, 0.0, fault, monitor, passing)
+    return replace(decision, value=harmless * torch.nan, margin=harmless * torch.nan)
 
 
 def first_fault(fault: Tensor, where: Tensor, reason: Reason) -> Tensor:

@@ -11,6 +11,9 @@ from torch import Tensor
 
 Latent = dict[str, Tensor]
 
+ABSURD = 1e3
+"""Larger numbers than this mean nothing: those of trained models stay within a few tens."""
+
 
 def map_latent(latent: Latent, function: Callable[..., Tensor], *others: Latent) -> Latent:
     """Apply a function to each tensor of a latent (and to the same tensors of others)."""
@@ -25,6 +28,12 @@ def select(latent: Latent, index: Tensor | slice) -> Latent:
 def replace_rows(latent: Latent, new: Latent, where: Tensor) -> Latent:
     """Rows of `new` where the mask (B,) holds, of `latent` elsewhere."""
     return map_latent(latent, lambda a, b: torch.where(where.reshape(-1, *[1] * (a.ndim - 1)), b, a), new)
+
+
+def is_sound(tensors: Latent) -> Tensor:
+    """Whether a batch of latents, or of percepts, holds what a model can mean: finite, no number absurd. Bool (B,)."""
+    # NaN is not at most anything.
+    return torch.stack([(t.abs() <= ABSURD).flatten(1).all(1) for t in tensors.values()]).all(0)
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from lerobot_latentsafe.latent import ABSURD
 from lerobot_latentsafe.runtime.distributed import mean_over_ranks
 
 
@@ -52,8 +53,9 @@ class FailureMargin(nn.Module):
         return self.net(features).squeeze(-1)
 
     def bounded(self, features: Tensor) -> Tensor:
-        """tanh l of features (..., D): (...,) in (-1, 1)."""
-        return torch.tanh(self(features))
+        """tanh l of features (..., D): (...,) in (-1, 1); NaN where l is absurd, which tanh would hide."""
+        margin = self(features)
+        return torch.tanh(torch.where(margin.abs() <= ABSURD, margin, torch.nan))
 
 
 def hinge_loss(margin: Tensor, failure: Tensor, delta: float = 0.75) -> Tensor:

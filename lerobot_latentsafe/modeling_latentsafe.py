@@ -17,12 +17,14 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
-from lerobot_latentsafe._compat import NOT_AVERAGED
+from lerobot_latentsafe._compat import EVALUATION, NOT_AVERAGED, ROLLOUT, called_from
 from lerobot_latentsafe.base_policy import BasePolicy, base_to_shield
 from lerobot_latentsafe.configuration_latentsafe import SEALED, SEALED_ENTRIES, LatentSafeConfig
 from lerobot_latentsafe.datasets.adoption import adopt_dataset, check_candidates
 from lerobot_latentsafe.datasets.clips import FilterData
+from lerobot_latentsafe.datasets.live_cameras import looks_of
 from lerobot_latentsafe.decision import FilterDecision, LawOptions, Reason
+from lerobot_latentsafe.guard import standing_still
 from lerobot_latentsafe.model_card import make_model_card
 from lerobot_latentsafe.runtime.checkpoint import (
     BASE_FOLDER,
@@ -37,6 +39,7 @@ from lerobot_latentsafe.runtime.checkpoint import (
 )
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
 from lerobot_latentsafe.runtime.processors import check_own_processors
+from lerobot_latentsafe.runtime.time_limit import TimeLimit
 from lerobot_latentsafe.safety_model import SafetyModel, UntrainedFilterError
 from lerobot_latentsafe.shield import Shield
 
@@ -76,6 +79,8 @@ class LatentSafePolicy(PreTrainedPolicy):
         setattr(self, NOT_AVERAGED, self._never_averaged())
         self._told_untrained = False
         self._base: list[BasePolicy] = []  # in a list, so that its weights are not ours
+        self._base_lost = False
+        self._in_time = TimeLimit(self.model.device.type)
         self.shield = Shield(self.model)
         if config.base_policy_path:
             self.attach(config.base_policy_path)
@@ -144,9 +149,13 @@ class LatentSafePolicy(PreTrainedPolicy):
 
     def reset(self) -> None:
         """Start an episode."""
+        if called_from(EVALUATION):  # a simulation waits for every action
+            self.shield.clock = standing_still
+        self.shield.pace.strict |= called_from(ROLLOUT)
         self.shield.reset()
+        self.shield.warm_up()
         if self.base:
-            self.base.reset()
+            self._replan(None)
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
@@ -168,21 +177,59 @@ class LatentSafePolicy(PreTrainedPolicy):
 
     @torch.no_grad()
     def decide(self, batch: dict[str, Tensor], age_s: float = 0.0) -> FilterDecision:
-        """Like `select_action`, with the whole decision."""
+        """Like `select_action`, with the whole decision.
+
+        Args:
+            age_s: seconds since before the observation was taken.
+        """
         self.model.require_trained_for_law()
+        self.shield.offer()
         if self.base is None:
             return self._judge(batch, None, age_s, missing_reason=Reason.NO_BASE_POLICY)
-        try:
-            proposed = self.base.propose(batch)
-        except Exception:
-            if self.config.law.mode == "monitor":
-                raise
-            logger.exception("base policy failed; the fallback acts")
-            proposed = None
-        decision = self._judge(batch, proposed, age_s)
-        if decision.intervened.any():
-            self.base.replan(decision.action)
+        began = self.shield.clock()
+        proposed, wrong = self._ask_base(batch, age_s)
+        planned = None if proposed is None else self.base.planned
+        age_s += self.shield.clock() - began
+        decision = self._judge(batch, proposed, age_s, missing_reason=wrong, planned=planned)
+        # A policy that is only late keeps its plan where the robots stayed meanwhile.
+        stayed = wrong == Reason.DEADLINE_MISSED and self.shield.guard.holding.all()
+        if decision.intervened.any() and not stayed:
+            self._replan(decision.action)
         return decision
+
+    def _ask_base(self, batch: dict[str, Tensor], age_s: float) -> tuple[Tensor | None, Reason]:
+        """What the base policy proposes; None, and why, if it gives nothing in time."""
+        if self._base_lost:
+            self._replan(None)
+        if self._base_lost:
+            return None, Reason.BASE_POLICY_FAILED
+        # It gets an observation of its own: what it does to it must not change what is judged.
+        own = {key: value.clone() if isinstance(value, Tensor) else value for key, value in batch.items()}
+        try:
+            if self.shield.clock is standing_still:
+                return self.base.propose(own), Reason.BASE_POLICY_FAILED
+            left_s = self.shield.time_left(age_s, _rows(batch))
+            return self._in_time(lambda: self.base.propose(own), left_s), Reason.BASE_POLICY_FAILED
+        except TimeoutError as e:
+            self.shield.note_failure("the base policy was late", e)
+            return None, Reason.DEADLINE_MISSED
+        except (Exception, SystemExit) as e:
+            if self.config.law.mode == "monitor":  # there is nothing else to do than what the policy wants
+                raise
+            self.shield.note_failure("the base policy failed", e)
+            return None, Reason.BASE_POLICY_FAILED
+
+    def _replan(self, executed: Tensor | None) -> None:
+        """Have the base policy plan anew after an override (B, A), or begin; one that cannot is asked nothing."""
+        if self._in_time.busy:  # it is still at work on what is past
+            self._base_lost = True
+            return
+        try:
+            self.base.reset() if executed is None else self.base.replan(executed)
+            self._base_lost = False
+        except (Exception, SystemExit) as e:
+            self._base_lost = True
+            self.shield.note_failure("the base policy could not plan anew", e)
 
     @torch.compiler.disable
     def _judge(self, *given: Any, **options: Any) -> FilterDecision:
@@ -252,6 +299,11 @@ class LatentSafePolicy(PreTrainedPolicy):
         return make_model_card(self.config, dataset_repo_id, license, tags)
 
 
+def _rows(batch: dict[str, Tensor]) -> int:
+    """For how many robots an observation is."""
+    return max((len(v) for v in batch.values() if isinstance(v, Tensor) and v.dim() > 1), default=1)
+
+
 def _check(folder: Path, config: PreTrainedConfig, training: bool) -> None:
     """Refuse a filter that is not as it was saved, in the configuration that is used.
 
@@ -297,6 +349,7 @@ def load_filter(
         policy.config.change(law=policy.config.law.changed(law))
     if base_policy is not None:
         policy.attach(base_policy)
+    policy.shield.warm_up()
     return policy
 
 
@@ -317,6 +370,8 @@ def adopt(config: LatentSafeConfig, meta: LeRobotDatasetMetadata) -> FilterData:
         data.check_cameras({key: config.input_features[key].shape for key in data.cameras})
     trained_on = adopt_dataset(config.trained_on, data.contract)
     trained_on.cameras = list(data.cameras)
+    if trained_on.looks is None:
+        trained_on.looks = looks_of(meta, data.contract, trained_on, data.cache)
     check_candidates(config.fallback.action_candidates, trained_on, meta.repo_id)
     features = {key: feature for key, feature in config.input_features.items() if key not in data.contract.left_out}
     features |= {key: PolicyFeature(FeatureType.VISUAL, shape) for key, shape in data.cameras.items()}

@@ -193,7 +193,8 @@ class SafetyModel(nn.Module):
 
     @property
     def _stage_of_law(self) -> str:
-        return "critic" if self.config.law.name in BACKUPS else "world_model"
+        law = self.config.law.name
+        return "critic" if law in BACKUPS else "guard" if law == "guard" else "world_model"
 
     def is_trained_for_law(self) -> bool:
         """Whether training has come far enough for the law to decide."""
@@ -224,6 +225,7 @@ class SafetyModel(nn.Module):
         trained_on = self.config.trained_on
         if not trained_on.has_reached(stage):
             part, command = {
+                "guard": ("range", "latentsafe guard --dataset.repo_id=..."),
                 "world_model": ("world model", "lerobot-train --policy.type=latentsafe"),
                 "critic": ("safety critic", "latentsafe train-reachability --policy.path=..."),
             }[stage]

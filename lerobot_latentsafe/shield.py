@@ -1,32 +1,46 @@
-"""The shield: what stands between any base policy and a robot. History, units, timing and faults live here.
+"""The shield: what stands between any base policy and a robot. A guard, and a world model that looks ahead.
 
-The policy wrapper and every other adapter share this one core. Its rule: nothing that is not finite, fresh, in time
-and in range ever counts as safe.
+The policy wrapper and every other adapter share this one core. Its rule: nothing that is not finite, fresh, in time,
+in range and familiar ever counts as safe; and whatever fails, there is a decision.
 """
 
 import logging
+import threading
 import time
 import weakref
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from lerobot_latentsafe.configuration_latentsafe import SEALED
-from lerobot_latentsafe.decision import RECENT, FilterDecision, Reason, first_fault, least_restrictive
-from lerobot_latentsafe.encoders.pictures import check_proportions
-from lerobot_latentsafe.latent import Belief, Latent, map_latent, replace_rows
+from lerobot_latentsafe.decision import RECENT, FilterDecision, Reason, by_checks_alone, first_fault, least_restrictive
+from lerobot_latentsafe.guard import UNSEEN, Guard, Pace, Seen
+from lerobot_latentsafe.latent import Belief, Latent, is_sound, map_latent, replace_rows
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
 from lerobot_latentsafe.safety_model import SafetyModel
 
 logger = logging.getLogger(__name__)
 
-BLIND = (
-    Reason.OBSERVATION_NOT_FINITE, Reason.OBSERVATION_MISSING, Reason.OBSERVATION_STALE, Reason.OBSERVATION_OUT_OF_RANGE
-)  # fmt: skip
-"""What is wrong with observations that the world model must not see."""
+
+class Judgement(NamedTuple):
+    """What the world model says of an action.
+
+    Attributes:
+        belief: of the episode, with what is seen now.
+        value, margin: (B,), V of the action and l now; NaN where nothing can be known.
+        fallback: (B, A) in robot units.
+        retreats: bool (B,), whether an override would be the retreat's.
+    """
+
+    belief: Belief
+    value: Tensor
+    margin: Tensor
+    fallback: Tensor
+    retreats: Tensor
 
 
 class Shield:
@@ -36,44 +50,45 @@ class Shield:
 
     Args:
         model: a trained safety model, and by its configuration the law.
-        clock: seconds, monotonic; replaceable in tests.
+        clock: seconds, monotonic; `standing_still` where a simulation waits for the decision.
 
     Attributes:
-        pose: (B, S) in robot units, the last usable reading of each number of the state; NaN before there was one.
-        missed: (B, S), ticks since then.
-        told: (B, A) in robot units, what the robots were told last.
-        executed: (B, A), the same as the world model hears it.
-        moving: bool (B, A), whether what each target is of has moved since the last tick.
-        stay: (B, A) in robot units, what would have been to stay at the last tick.
-        holding: bool (B, A), commands that were told to stay.
+        guard: checks what is seen and told.
+        pace: of the decisions.
+        executed: (B, A), what the robots were told last, as the world model hears it.
+        observed: what the last decision was made on.
+        took_s: seconds that the last decision took.
+        failures: what failed -> how often.
     """
 
     def __init__(self, model: SafetyModel, clock: Callable[[], float] = time.perf_counter):
-        self.model, self.clock = model, clock
-        keep_freed_memory()
-        self._told_clipped = False
+        self.model, self.clock, self.guard = model, clock, Guard(model)
+        self.pace = Pace(model.config.trained_on.fps)
+        self.failures: Counter[str] = Counter()
+        self.took_s, self._warm = 0.0, False
+        self._lock = threading.RLock()
         self._same_weights: weakref.WeakKeyDictionary[Shield, bool] = weakref.WeakKeyDictionary()
+        keep_freed_memory()
         self.reset()
-        _shields.add(self)
 
     def __getstate__(self) -> dict[str, Any]:
         """A copy, or one that was pickled, compares its weights with others' anew."""
-        return {name: value for name, value in self.__dict__.items() if name != "_same_weights"}
+        return {name: value for name, value in self.__dict__.items() if name not in ("_same_weights", "_lock")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state, _same_weights=weakref.WeakKeyDictionary())
-        _shields.add(self)
+        self.__dict__.update(state, _same_weights=weakref.WeakKeyDictionary(), _lock=threading.RLock())
 
     def reset(self) -> None:
         """Forget the history: call at the start of every episode."""
+        with self._lock:
+            self.pace.forget()
+            self._forget()
+
+    def _forget(self) -> None:
+        self.guard.reset()
         self.belief = Belief()
-        self.pose: Tensor | None = None
-        self.missed: Tensor | None = None
-        self.told: Tensor | None = None
         self.executed: Tensor | None = None
-        self.moving: Tensor | None = None
-        self.stay: Tensor | None = None
-        self.holding: Tensor | None = None
+        self.observed: dict[str, Tensor] | None = None
         self.decision: FilterDecision | None = None
         self.decided_at: float | None = None
         self.recent: Tensor | None = None
@@ -81,60 +96,116 @@ class Shield:
         self._told = False
 
     @torch.no_grad()
+    def warm_up(self) -> None:
+        """Judge nothing once, between episodes, so that the first decision is no slower than the others."""
+        if not self.model.is_trained_for_law() or self._warm:
+            return
+        with self._lock, self.model.single_precision():
+            units, size = self.model.units, self.model.config.world_model.image_size
+            images = {key: torch.zeros(1, 3, size, size, device=units.device) for key in self.guard.cameras.keys}
+            self.guard.pose = units.state_mean[None]
+            hold, fault = (
+                units.hold(self.guard.pose).nan_to_num(0.0),
+                torch.zeros(1, dtype=torch.long, device=units.device),
+            )
+            self._forget_overrides(1)
+            self._judge(Seen(images, self.guard.pose, fault), fault, self._hear(hold), hold)
+            self._warm = True
+            self._forget()
+
+    @torch.no_grad()
     def __call__(
         self,
-        observation: dict[str, Tensor],
+        observation: dict[str, Any],
         proposed: Tensor | None,
         age_s: float = 0.0,
         missing_reason: Reason = Reason.BASE_POLICY_FAILED,
         fault: Reason = Reason.PASSED,
+        planned: Tensor | None = None,
     ) -> FilterDecision:
         """Decide on one proposed action.
 
         Args:
             observation: LeRobot batch: images (B, C, H, W) in [0, 1], observation.state (B, S) in robot units.
             proposed: (B, A) in robot units, or None if there is none.
-            age_s: how old the observation is, seconds; older than one period of the filter's fps is stale.
+            age_s: seconds since before the observation was taken.
             missing_reason: the reason to give where there is no proposal.
             fault: what the caller has found wrong, if anything.
+            planned: (B, N, A) in robot units, what is to come after `proposed`, if it was just planned.
 
         Returns:
-            The decision, also kept as `self.decision`.
+            The decision, also kept as `self.decision`; use the one that is returned, others may decide meanwhile.
 
         Raises:
+            UntrainedFilterError: training has not come far enough for the law.
+            KeyError, ValueError: the very first observation is none of this robot, or the number of robots changed.
             UnknownPoseError: a robot whose commands are targets has shown no usable state, and was told nothing yet.
         """
-        started, law = self.clock(), self.model.config.law
-        images, state, faults = self._check_observation(observation, age_s)
-        hold = self._hold(state)
-        faults, proposed, clipped = self._check_action(proposed, faults, hold, missing_reason)
-        everyone = torch.ones_like(faults, dtype=torch.bool)
-        faults = first_fault(faults, everyone, fault)
-        if self.recent is None:
-            self._forget_overrides(len(state))
-        # What is wrong is not judged: in its place stands what would be done instead, to stay.
-        judged = self._hear(torch.where((faults != Reason.PASSED)[:, None], hold, clipped))
-        belief = self._filter_history(images, self.model.units.normalise_state(state), judged, faults)
-        value, margin, retreats, fallback = self._judge(belief.latent, judged, hold)
-        finished = self.clock()
-        if law.deadline_ms is not None and (finished - started) * 1e3 > law.deadline_ms:
-            faults = first_fault(faults, everyone, Reason.DEADLINE_MISSED)
-        fallback = torch.where(self._stays(faults, value, state), hold, fallback)
-        decision = least_restrictive(
-            proposed, fallback, value, margin, self._threshold(), faults, law.mode == "monitor", clipped
-        )
-        decision = replace(decision, heard=judged)
-        acts = decision.intervened
-        self.recent = torch.cat([self.recent[:, 1:], acts[:, None]], 1)
-        self.retreated = (self.retreated + 1) * (acts & retreats)
-        self.belief, self.decision, self.decided_at = belief, decision, finished
-        self.stay = hold
-        self.was_executed(decision.action)
-        self._tell(decision)
-        return decision
+        self.model.require_trained_for_law()
+        self._say_if_disarmed()
+        with self._lock:
+            started, law = self.clock(), self.model.config.law
+            rate = self.pace.tick(started, law.slack_ms)
+            if self.pace.paused:
+                logger.info("the filter starts anew after a pause")
+                self._forget()
+            seen = self.guard.observe(observation)
+            faults = self._late(seen.fault, age_s, Reason.OBSERVATION_STALE)
+            hold = self.guard.hold(seen.state)
+            faults, proposed, clipped = self.guard.check_action(proposed, faults, hold, missing_reason, planned)
+            for found in (fault, rate):
+                faults = first_fault(faults, torch.ones_like(faults, dtype=torch.bool), found)
+            if self.recent is None:
+                self._forget_overrides(len(hold))
+            # What is wrong is not judged: in its place stands what would be done instead, to stay.
+            judged = self._hear(torch.where((faults != Reason.PASSED)[:, None], hold, clipped))
+            judgement, faults = self._judge(seen, faults, judged, hold)
+            finished = self.clock()
+            self.took_s = finished - started
+            faults = self._late(faults, age_s + self.took_s, Reason.DEADLINE_MISSED, len(hold), self.took_s)
+            decision = self._decide(judgement, seen, faults, hold, proposed, clipped)
+            decision = replace(decision, heard=judged)
+            self._remember(judgement, decision, observation, finished)
+            return decision
 
-    def _judge(self, latent: Latent, judged: Tensor, hold: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """V of an action and l now (B,); whether an override would be the retreat's (B,); the fallback (B, A)."""
+    def _say_if_disarmed(self) -> None:
+        """Warn once of each law that does not heed what is seen."""
+        disarmed = self.model.config.law.disarmed
+        if disarmed is not None:
+            self.guard.say_once("THIS FILTER DOES NOT ACT BY WHAT IT SEES", disarmed)
+
+    def time_left(self, age_s: float, n: int = 1) -> float:
+        """Seconds that a base policy may take for n robots, so that the decision after it is still in time."""
+        return self.pace.oldest(self.model.config.law.slack_ms, n) - age_s - self.took_s
+
+    def _late(self, faults: Tensor, age_s: float, reason: Reason, n: int = 1, took_s: float = 0.0) -> Tensor:
+        """Mark all as late where an observation is too old, or a decision took too long; a time that is no number is.
+
+        Args:
+            n: robots that one call decides for; each has a period.
+        """
+        law, everyone = self.model.config.law, torch.ones_like(faults, dtype=torch.bool)
+        in_time = 0 <= age_s <= self.pace.oldest(law.slack_ms, n)
+        in_time &= took_s >= 0 and (law.deadline_ms is None or took_s * 1e3 <= law.deadline_ms)
+        return faults if in_time else first_fault(faults, everyone, reason)
+
+    def _judge(self, seen: Seen, faults: Tensor, judged: Tensor, hold: Tensor) -> tuple[Judgement, Tensor]:
+        """What the world model says of actions as it hears them (B, A), and the faults with its own."""
+        nothing = torch.full((len(hold),), torch.nan, device=hold.device)
+        staying = Judgement(self.belief, nothing, nothing, hold, torch.zeros_like(nothing, dtype=torch.bool))
+        if self.model.config.law.name == "guard":
+            return staying, faults
+        try:
+            percepts = self.model.world_model.perceive(seen.images)
+            faults = first_fault(faults, ~is_sound(percepts), Reason.FILTER_FAILED)
+            belief = self._filter_history(percepts, seen.state, judged, faults)
+            return Judgement(belief, *self._look_ahead(belief.latent, judged, hold)), faults
+        except Exception as e:
+            self.note_failure("the filter failed", e)
+            return staying, first_fault(faults, torch.ones_like(faults, dtype=torch.bool), Reason.FILTER_FAILED)
+
+    def _look_ahead(self, latent: Latent, judged: Tensor, hold: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """V of an action and l now (B,); the fallback (B, A); whether an override would be the retreat's (B,)."""
         model = self.model
         margin = model.imagination.margin(latent)
         predicted, on_the_way = self._go_on(latent, judged)
@@ -146,7 +217,31 @@ class Shield:
         fallback = torch.where(moves[:, None], self._retreat(hold), self._usable(action, here, hold))
         # A margin that is negative now, or on the way, is a failure whatever comes after.
         value = model.worst(on_the_way, value).view(-1, len(hold)).amin(0)
-        return model.worst(margin, value), margin, retreats, fallback
+        value = torch.where(is_sound(latent), model.worst(margin, value), torch.nan)
+        return value, margin, fallback, retreats
+
+    def _decide(
+        self, judgement: Judgement, seen: Seen, faults: Tensor, hold: Tensor, proposed: Tensor, clipped: Tensor
+    ) -> FilterDecision:
+        """The law's decision, once all that can be known is known."""
+        law, value = self.model.config.law, judgement.value
+        threshold = self._threshold()
+        fallback = torch.where(self._stays(faults, value, seen.state), hold, judgement.fallback)
+        monitors = law.mode == "monitor"
+        if law.name == "guard":
+            return by_checks_alone(proposed, hold, faults, monitors, clipped)
+        return least_restrictive(proposed, fallback, value, judgement.margin, threshold, faults, monitors, clipped)
+
+    def _remember(
+        self, judgement: Judgement, decision: FilterDecision, observation: dict[str, Any], finished: float
+    ) -> None:
+        acts = decision.intervened
+        self.recent = torch.cat([self.recent[:, 1:], acts[:, None]], 1)
+        self.retreated = (self.retreated + 1) * (acts & judgement.retreats)
+        self.belief, self.decision, self.decided_at = judgement.belief, decision, finished
+        self.observed = {key: observation[key] for key in self.model.inputs if key in observation}
+        self.was_executed(decision.action)
+        self._tell(decision)
 
     @property
     def latent(self) -> Latent | None:
@@ -155,12 +250,18 @@ class Shield:
 
     def was_executed(self, action: Tensor) -> None:
         """Remember (B, A) in robot units as what was done; call it where something else was than was decided."""
-        self.told, self.executed = action, self._hear(action)
-        self.holding = None if self.stay is None else torch.isclose(action, self.stay)
+        self.guard.was_told(action)
+        self.executed = self._hear(action)
 
     def _hear(self, action: Tensor) -> Tensor:
         """An action (B, A) in robot units as the world model hears it; what is not known does not move."""
-        return self.model.units.heard_action(action, self.pose).nan_to_num(0.0)
+        return self.model.units.heard_action(action, self.guard.pose).nan_to_num(0.0)
+
+    def note_failure(self, what: str, error: BaseException) -> None:
+        """Count a failure that a decision survived; its trace is logged the first time."""
+        self.failures[what] += 1
+        trace = error if self.failures[what] == 1 else None
+        logger.error("%s (%s: %s); nothing passes for that", what, type(error).__name__, error, exc_info=trace)
 
     def _stays(self, fault: Tensor, value: Tensor, state: Tensor) -> Tensor:
         """Commands (B, A) that stay as they were, instead of the fallback's.
@@ -208,25 +309,38 @@ class Shield:
         acts = "acts" if decision.intervened.any() else "would act"
         logger.info("the filter %s for the first time in this episode: %s", acts, reasons)
 
-    def adopt(self, action: Tensor, within_s: float) -> bool:
-        """Take over the decision, and the memory, of another shield of this process that just let this action through.
+    def offer(self) -> None:
+        """Let a shielded robot of this process take over what this shield decides: a policy's, not a robot's."""
+        _offered.add(self)
 
-        It must be the same filter under a law no laxer than ours: deciding again would only repeat it.
+    def adopt(self, observation: dict[str, Tensor], action: Tensor, age_s: float = 0.0) -> FilterDecision | None:
+        """The decision, with the memory, of a policy's shield that just let this action through, if there is one.
+
+        It must be the same filter, under a law no laxer than ours, and have seen the very same: deciding again would
+        only repeat it.
 
         Args:
+            observation: what we see.
             action: (1, A) in robot units.
-            within_s: how long ago that decision may be, seconds.
+            age_s: seconds since before the observation was taken.
         """
-        for other in _shields - {self}:
-            fresh = other.decided_at is not None and 0 <= self.clock() - other.decided_at <= within_s
-            if fresh and torch.equal(other.decision.action.cpu(), action) and self._accepts(other):
-                self.belief, self.pose, self.missed = other.belief, other.pose, other.missed
-                self.told, self.executed = other.told, other.executed
-                self.moving, self.holding = other.moving, other.holding
-                self.decision, self.decided_at = other.decision, other.decided_at
-                self.recent, self.retreated = other.recent, other.retreated
-                return True
-        return False
+        if not 0 <= age_s <= self.pace.oldest(self.model.config.law.slack_ms):
+            return None
+        for other in _offered - {self}:
+            with self._lock, other._lock:
+                if not (other._decided(observation, action) and self._accepts(other)):
+                    continue
+                for name in ("belief", "executed", "observed", "decision", "decided_at", "recent", "retreated"):
+                    setattr(self, name, getattr(other, name))
+                self.guard.adopt(other.guard)
+                return self.decision
+        return None
+
+    def _decided(self, observation: dict[str, Tensor], action: Tensor) -> bool:
+        """Whether our last decision was to do this (1, A) after seeing this."""
+        if self.decision is None or self.observed is None:
+            return False
+        return torch.equal(self.decision.action.cpu(), action.cpu()) and _same(observation, self.observed)
 
     def _accepts(self, other: "Shield") -> bool:
         """Whether the other has our weights, and lets nothing pass that we would not."""
@@ -242,94 +356,19 @@ class Shield:
             )
         return self._same_weights[other]
 
-    def _check_observation(
-        self, observation: dict[str, Tensor], age_s: float
-    ) -> tuple[dict[str, Tensor], Tensor, Tensor]:
-        """Images as the model takes them, the state (B, S) in robot units, the first fault of each row.
-
-        Numbers of the state that are not usable are NaN; `pose` holds what was read of them before.
-        """
-        model, cameras = self.model, self.model.world_model.image_keys
-        missing = [key for key in model.inputs if key not in observation]
-        if missing:
-            raise KeyError(
-                f"observation lacks {', '.join(missing)}; this filter was trained on "
-                f"{', '.join(model.inputs)}. Got "
-                f"{', '.join(k for k in observation if k.startswith('observation'))}. Rename the camera or state "
-                "(--rename_map), or train a filter for this robot"
-            )
-        state = model.state(observation)
-        if self.executed is not None and len(self.executed) != len(state):
-            raise ValueError(
-                f"the batch went from {len(self.executed)} to {len(state)} robots within an episode; "
-                "call reset() between episodes"
-            )
-        fault = torch.zeros(len(state), dtype=torch.long, device=model.device)
-        images = {}
-        finite = torch.isfinite(state).all(-1)
-        if self.pose is None:
-            self.pose, self.missed = torch.full_like(state, torch.nan), torch.zeros_like(state)
-        usable = model.units.believable(state, self.pose, self.missed)
-        state = torch.where(usable, state, torch.nan)
-        self.moving = model.units.moves(state, self.pose)
-        self.pose, self.missed = torch.where(usable, state, self.pose), (self.missed + 1) * ~usable
-        for key in cameras:
-            image = model.place(observation[key])
-            check_proportions(key, tuple(image.shape[1:]), model.config.input_features[key].shape)
-            low, high = image.amin((1, 2, 3)), image.amax((1, 2, 3))  # NaN if anything is; aminmax is five times slower
-            colours = torch.isfinite(low) & torch.isfinite(high) & (low >= -1e-3) & (high <= 1 + 1e-3)
-            finite &= colours
-            images[key] = model.images(image if colours.all() else image.nan_to_num(0.0).clamp(0, 1)).clamp(0, 1)
-            # A camera that delivers one flat colour is covered or dead.
-            fault = first_fault(fault, high - low < 1e-3, Reason.OBSERVATION_MISSING)
-        fault = first_fault(fault, ~finite, Reason.OBSERVATION_NOT_FINITE)
-        fault = first_fault(fault, ~usable.all(-1), Reason.OBSERVATION_OUT_OF_RANGE)
-        if age_s > 1.0 / model.config.trained_on.fps or not age_s >= 0:
-            fault = first_fault(fault, torch.ones_like(finite), Reason.OBSERVATION_STALE)
-        return images, state, fault
-
-    def _check_action(
-        self, proposed: Tensor | None, fault: Tensor, hold: Tensor, missing_reason: Reason
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Faults, the proposal and what of it lies in the data's range: (B,), (B, A), (B, A) in robot units."""
-        units = self.model.units
-        if proposed is None:
-            fault = first_fault(fault, torch.ones_like(fault, dtype=torch.bool), missing_reason)
-            proposed = hold
-        proposed = self.model.place(proposed)
-        expected = (len(hold), len(units.action_low))
-        if tuple(proposed.shape) != expected:
-            raise ValueError(
-                f"proposed action has shape {tuple(proposed.shape)}, expected {expected}: "
-                f"{', '.join(units.action_names)}. The base policy must be of the filter's action space"
-            )
-        finite = torch.isfinite(proposed).all(-1)
-        fault = first_fault(fault, ~finite, Reason.ACTION_NOT_FINITE)
-        clipped, out_of_range = units.clip(torch.where(finite[:, None], proposed, hold), self.pose)
-        fault = first_fault(fault, out_of_range, Reason.ACTION_OUT_OF_RANGE)
-        return fault, proposed, self._tell_clipped(proposed, clipped, fault)
-
-    def _tell_clipped(self, proposed: Tensor, clipped: Tensor, fault: Tensor) -> Tensor:
-        """What is executed of proposals that pass; says so once where that is not the proposal itself."""
-        passes = (fault == Reason.PASSED)[:, None]
-        beyond = passes & ((clipped - proposed).abs() > 1e-5 * proposed.abs().clamp(min=1))
-        if not self._told_clipped and beyond.any():
-            self._told_clipped = True
-            names = ", ".join(name for name, any_row in zip(self.model.units.action_names, beyond.any(0)) if any_row)
-            logger.warning("the policy leaves the range of the data a little; what is executed is clipped: %s", names)
-        return torch.where(beyond, clipped, proposed)  # others pass to the bit
-
-    def _filter_history(self, images: dict[str, Tensor], state: Tensor, judged: Tensor, fault: Tensor) -> Belief:
+    def _filter_history(self, percepts: Latent, state: Tensor, judged: Tensor, faults: Tensor) -> Belief:
         """What the world model makes of the episode; rows whose observation is unusable go on by imagination alone."""
         world_model, units = self.model.world_model, self.model.units
-        percepts = world_model.perceive(images)
-        blind, state = torch.isin(fault, fault.new_tensor(BLIND)), state.nan_to_num(0.0)
+        state, blind = units.normalise_state(state).nan_to_num(0.0), torch.isin(faults, faults.new_tensor(UNSEEN))
         before = judged if self.executed is None else self.executed
+        first = units.first_action(before)
 
         def observe(latent: Latent | None) -> Latent:
-            start = latent is None
-            latent = world_model.initial(len(state)) if start else latent
-            predicted = world_model.step(latent, units.first_action(before) if start else before)
+            new, led = world_model.initial(len(state)), first
+            if latent is not None:  # what went wrong once must not poison the rest of an episode
+                lost = ~is_sound(latent)
+                new, led = replace_rows(latent, new, where=lost), torch.where(lost[:, None], first, before)
+            predicted = world_model.step(new, led)
             return replace_rows(world_model.correct(predicted, percepts, state), predicted, where=blind)
 
         return self.belief.after(observe, self.model.config.law.history_frames)
@@ -352,25 +391,19 @@ class Shield:
     def _usable(self, action: Tensor, value: Tensor, hold: Tensor) -> Tensor:
         """The safety policy's action in robot units; where it or its value is not finite, hold."""
         units = self.model.units
-        finite = (torch.isfinite(action).all(-1) & torch.isfinite(value))[:, None].expand_as(action)
+        robots = units.denormalise_action(action, self.guard.pose)
+        clipped, far = units.clip(robots, self.guard.pose)  # a fallback is checked like any other action
+        sound = (torch.isfinite(robots).all(-1) & torch.isfinite(value) & ~far)[:, None].expand_as(action)
         # A target that does not move stays as it was told, so that an arm does not sink, and a grip does not open.
-        finite = finite & ~(units.stays | (units.is_target & (action == 0)))
-        return torch.where(finite, units.denormalise_action(action, self.pose), hold)
-
-    def _hold(self, state: Tensor) -> Tensor:
-        """Stay: (B, A) in robot units."""
-        settled = ~self.moving if self.holding is None else ~self.moving | self.holding
-        hold = self.model.units.hold(state, self.told, settled)
-        if not hold.isfinite().all() and self.model.config.law.mode != "monitor":
-            raise UnknownPoseError(
-                "the first observation of the episode shows no usable state, and these commands are positions: nobody "
-                "knows where the robot is, so nothing is commanded. See to the robot's sensors, and start again"
-            )
-        return hold
+        sound = sound & ~(units.stays | (units.is_target & (action == 0)))
+        return torch.where(sound, clipped, hold)
 
 
-class UnknownPoseError(RuntimeError):
-    """Nobody knows where the robot is, and it takes positions: there is no command that is known to be harmless."""
+def _same(observation: dict[str, Any], other: dict[str, Any]) -> bool:
+    """Whether two observations hold the same numbers."""
+    return observation.keys() >= other.keys() and all(
+        isinstance(value, Tensor) and torch.equal(value.cpu(), observation[key].cpu()) for key, value in other.items()
+    )
 
 
-_shields: "weakref.WeakSet[Shield]" = weakref.WeakSet()
+_offered: "weakref.WeakSet[Shield]" = weakref.WeakSet()

@@ -1,7 +1,12 @@
 """Training on top of a frozen world model: the failure margin by itself, and reachability in imagination."""
 
+import hashlib
+import json
+import logging
 import time
-from dataclasses import replace
+from contextlib import nullcontext, suppress
+from dataclasses import asdict, replace
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +21,18 @@ from lerobot_latentsafe.latent import Latent, map_latent, select
 from lerobot_latentsafe.margin import FailureMargin, hinge_loss
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
 from lerobot_latentsafe.reachability import LatentReachability, Starts
-from lerobot_latentsafe.runtime.checkpoint import CONFIG
+from lerobot_latentsafe.runtime.checkpoint import CONFIG, CheckpointError, read_config
 from lerobot_latentsafe.runtime.distributed import gathered, rank, share
-from lerobot_latentsafe.runtime.files import refuse_existing
+from lerobot_latentsafe.runtime.files import claim, differing, refuse_existing, replacing_folder
 from lerobot_latentsafe.runtime.hub import save_policy
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
+from lerobot_latentsafe.runtime.options import require_at_least
 from lerobot_latentsafe.safety_model import SafetyModel
 
+logger = logging.getLogger(__name__)
+
+RUN = "run.json"
+"""Of what training a checkpoint is."""
 STARTS_BYTES = 2**30
 """Memory for the latents that imagination starts from; those of a transformer hold keys and values and are large."""
 
@@ -95,19 +105,29 @@ def train_margin(path: str | Path, dataset_meta, output_dir: Path, seed: int = 0
 
     The critic of another margin says nothing about this one: the stage goes back to `world_model`.
 
+    Returns:
+        What was saved; if the same was trained before, what lies there.
+
     Raises:
         UntrainedFilterError: the world model was never trained.
-        FileExistsError: output_dir holds a checkpoint already.
+        FileExistsError: output_dir holds something else.
+        FolderInUseError: another process trains there.
+        FloatingPointError: the training diverged; nothing is saved.
     """
-    refuse_existing(Path(output_dir) / CONFIG)
+    require_at_least("--seed", seed, 0)
     policy, reader = load_with_cache(path, dataset_meta, seed)
-    generator = torch.Generator().manual_seed(seed)
-    model, config, started = policy.model, policy.config, time.process_time()
-    features, failure = seen_and_imagined(model, reader, config.margin.clips, generator)
-    model.margin = model.new_margin()
-    fit_margin(model.margin, features, failure, config.margin.delta, generator)
-    config.change(trained_on=replace(config.trained_on, stage="world_model"), frame_cache=None)
-    save_policy(policy, output_dir)
+    run = _run(policy, reader, "margin", seed=seed)
+    before = _trained_before(Path(output_dir), run)
+    if before is not None:
+        return before
+    with replacing_folder(output_dir) as folder:
+        generator = torch.Generator().manual_seed(seed)
+        model, config, started = policy.model, policy.config, time.process_time()
+        features, failure = seen_and_imagined(model, reader, config.margin.clips, generator)
+        model.margin = model.new_margin()
+        fit_margin(model.margin, features, failure, config.margin.delta, generator)
+        config.change(trained_on=replace(config.trained_on, stage="world_model"), frame_cache=None)
+        _save(policy, model.margin, folder, run)
     print(f"margin: {time.process_time() - started:.0f} CPU-s")
     return policy
 
@@ -198,20 +218,42 @@ def train_reachability(
 
     Several ranks share the work (see `LatentReachability`); the first one saves.
 
+    Returns:
+        What was saved; if the same was trained before, what lies there.
+
     Raises:
         UntrainedFilterError: the world model was never trained.
-        FileExistsError: output_dir holds a checkpoint already.
-        ValueError: there is no such target.
+        FileExistsError: output_dir holds something else.
+        FolderInUseError: another process trains there.
+        FloatingPointError: the training diverged; nothing is saved.
+        ValueError: there is no such target, or nothing to be trained.
     """
     if target not in BACKUPS:
         raise ValueError(f"--target is {target!r}; expected one of {', '.join(BACKUPS)}")
-    refuse_existing(Path(output_dir) / CONFIG)
+    require_at_least("--steps", steps, 1)
+    require_at_least("--seeds", seed, 0)
     policy, reader = load_with_cache(path, dataset_meta, seed)
-    model, started = policy.model, time.process_time()
+    run = _run(policy, reader, "reachability", seed=seed, steps=steps, target=target)
+    before = _trained_before(Path(output_dir), run)
+    if before is not None:
+        return before
+    with replacing_folder(output_dir) if rank() == 0 else nullcontext() as folder:
+        started = time.process_time()
+        _learn_critic(policy, reader, seed, steps, target)
+        if rank() == 0:
+            _save(policy, policy.model.critic, folder, run)
+            print(f"reachability: {time.process_time() - started:.0f} CPU-s")
+    return policy
+
+
+def _learn_critic(policy: LatentSafePolicy, reader: ClipReader, seed: int, steps: int | None, target: str) -> None:
+    """Give a filter a trained critic."""
+    model = policy.model
     if model.device.type == "cpu":
         keep_freed_memory()
     generator = torch.Generator(device="cpu").manual_seed(seed)
     _aim_at(model, reader, target, steps)
+    require_at_least("--policy.reachability.steps", model.config.reachability.steps, 1)
     model.world_model.requires_grad_(False)
     model.margin.requires_grad_(False)
     starts = encoded_starts(model, reader, generator)
@@ -223,10 +265,6 @@ def train_reachability(
             progress.set_postfix(loss=f"{metrics['critic_loss']:.1e}", gamma=f"{metrics['gamma']:.4f}")
     policy.config.change(trained_on=replace(policy.config.trained_on, stage="critic"))
     model.critic.eval()
-    if rank() == 0:
-        save_policy(policy, output_dir)
-        print(f"reachability: {time.process_time() - started:.0f} CPU-s")
-    return policy
 
 
 def _aim_at(model: SafetyModel, reader: ClipReader, target: str, steps: int | None) -> None:
@@ -242,3 +280,68 @@ def _aim_at(model: SafetyModel, reader: ClipReader, target: str, steps: int | No
     trained_on = replace(config.trained_on, stage="world_model", target=target)
     config.change(trained_on=trained_on, law=law, reachability=reachability, fallback=fallback, frame_cache=None)
     model.critic = model.new_critic()
+
+
+# -- files ---
+
+
+def _run(policy: LatentSafePolicy, reader: ClipReader, stage: str, **options: object) -> dict:
+    """All that a training depends on, JSON-able."""
+    config, known = policy.config, hashlib.sha256()
+    for tensor in policy.state_dict().values():
+        known.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
+    groups = {name: asdict(getattr(config, name)) for name in ("margin", "reachability", "fallback")}
+    return {
+        "stage": stage,
+        "weights": known.hexdigest(),
+        "dataset": reader.cache.manifest["fingerprint"],
+        "labels": hashlib.sha256(reader.labels.failure.astype(np.int8)).hexdigest(),
+        **json.loads(json.dumps(groups, default=str)),
+        **options,
+    }
+
+
+def _save(policy: LatentSafePolicy, trained: nn.Module, folder: Path, run: dict) -> None:
+    """Save a filter and what its training was of, if what was trained is finite.
+
+    Raises:
+        FloatingPointError: it is not.
+    """
+    if not all(tensor.isfinite().all() for tensor in trained.state_dict().values()):
+        raise FloatingPointError(
+            f"the training diverged: {type(trained).__name__} holds numbers that are not finite, so nothing is saved; "
+            "train with another seed, or with smaller steps"
+        )
+    save_policy(policy, folder)
+    claim(folder / RUN, run)
+
+
+def _trained_before(output_dir: Path, run: dict) -> LatentSafePolicy | None:
+    """What the same run has saved already; a checkpoint of a filter that is torn is moved aside.
+
+    Raises:
+        FileExistsError: something else is there.
+    """
+    if not (output_dir / CONFIG).exists():
+        return None  # whoever fills the folder refuses what else is in it
+    if _is_torn(output_dir):
+        aside = next(p for n in count(1) if not (p := output_dir.with_name(f"{output_dir.name}.torn{n}")).exists())
+        if rank() == 0:
+            output_dir.rename(aside)
+            logger.warning("%s held a checkpoint that is not whole; it is now %s", output_dir, aside)
+        return None
+    if not (output_dir / RUN).exists() or differing(output_dir / RUN, run):
+        refuse_existing(output_dir)
+    print(f"{output_dir} holds the same already")
+    return load_filter(output_dir)
+
+
+def _is_torn(folder: Path) -> bool:
+    """Whether a folder holds a filter that cannot be loaded; other policies are none of ours."""
+    try:
+        load_filter(folder)
+    except CheckpointError:
+        with suppress(CheckpointError):
+            return read_config(folder).type == LatentSafePolicy.name
+        return True
+    return False

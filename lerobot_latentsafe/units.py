@@ -5,19 +5,24 @@ A motion is a command that is zero, or as it was, where nothing moves: a delta, 
 its displacement, the target minus the present state. So targets are converted where the state is known: here.
 """
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import torch
 from torch import Tensor, nn
 
+from lerobot_latentsafe.looks import Look
 from lerobot_latentsafe.meanings import Command, parse
 
-STAGES = ("untrained", "world_model", "critic")
+STAGES = ("untrained", "guard", "world_model", "critic")
 RANGE_TOLERANCE = 0.1
 """Share of the data's range by which a command may leave it: it is clipped, and judged and executed as clipped."""
 STATE_TOLERANCE = 1.0
 """Share of the data's range by which a number of the state may leave it and still be believed."""
+LEAP_TOLERANCE = 0.5
+"""Share of the data's largest change of a command from tick to tick by which a change may be larger."""
 STEP_TOLERANCE, MISSED_TICKS = 2.0, 1
 """A number of the state that changes by more than so many of the data's largest steps since it was read last is not
 believed; if it could not be read meanwhile, so many ticks count at most."""
@@ -32,7 +37,7 @@ class TrainedOn:
     """What the weights were trained on, and how far; filled in by the training commands, in robot units.
 
     Attributes:
-        stage: how far training has come: untrained, world_model, critic.
+        stage: how far training has come: untrained, guard (ranges alone), world_model, critic.
         target: what the critic was trained for: `reachability` (Eq. 5) or `risk` (SQRL).
         task: what the world model was trained to imagine, in words, where a policy of the same task must share it.
         cameras: the image features the filter reads, by default all of the dataset's.
@@ -44,10 +49,14 @@ class TrainedOn:
         action_low, action_high: least and largest command of the data.
         action_varies: False for commands that the data never vary; the filter keeps those and knows nothing else of
             them.
+        action_step, action_jerk: by how much each command changes from tick to tick at most, and by how much that
+            change does. Filters of versions before 0.4 do not know.
         displacement_low, displacement_high: least and largest displacement of each target, its 99th percentile in
             size is displacement_scale; 0, 0 and 1 for commands that are no targets.
         state_low, state_high, state_mean, state_std: of the data.
         state_step: by how much each number of the state changes from frame to frame at most.
+        unanswered: how far each command goes at most while the state stays as it is; see `looks.Response`.
+        looks: camera key -> what its pictures have in common.
     """
 
     stage: str = "untrained"
@@ -62,6 +71,8 @@ class TrainedOn:
     action_low: list[float] | None = None
     action_high: list[float] | None = None
     action_varies: list[bool] | None = None
+    action_step: list[float] | None = None
+    action_jerk: list[float] | None = None
     displacement_low: list[float] | None = None
     displacement_high: list[float] | None = None
     displacement_scale: list[float] | None = None
@@ -70,10 +81,14 @@ class TrainedOn:
     state_step: list[float] | None = None
     state_mean: list[float] | None = None
     state_std: list[float] | None = None
+    unanswered: list[float] | None = None
+    looks: dict[str, Look] | None = None
 
     def __post_init__(self) -> None:
         if self.stage not in STAGES:
             raise ValueError(f"stage is {self.stage!r}; expected one of {', '.join(STAGES)}")
+        if self.fps is not None and not 0 < self.fps < math.inf:
+            raise ValueError(f"fps is {self.fps!r}; expected frames a second, more than 0")
         if self.fps is not None and self.fps == round(self.fps):
             self.fps = round(self.fps)  # 15, not 15.0, wherever people read it
 
@@ -119,6 +134,8 @@ class Units(nn.Module):
     action_low: Tensor
     action_high: Tensor
     action_varies: Tensor
+    action_step: Tensor
+    action_jerk: Tensor
     displacement_low: Tensor
     displacement_high: Tensor
     displacement_scale: Tensor
@@ -130,6 +147,8 @@ class Units(nn.Module):
     frozen: Tensor
     stays: Tensor
     is_target: Tensor
+    adds_up: Tensor
+    unanswered: Tensor
     motion_low: Tensor
     motion_high: Tensor
     loudest: Tensor
@@ -140,6 +159,8 @@ class Units(nn.Module):
         self.action_names, self.state_names = trained_on.action_names or [], trained_on.state_names or []
         n_actions, n_states = len(trained_on.action_low), len(trained_on.state_mean)
         unknown = {
+            "action_step": [torch.inf] * n_actions, "action_jerk": [torch.inf] * n_actions,
+            "unanswered": [torch.inf] * n_actions,
             "displacement_low": [0.0] * n_actions, "displacement_high": [0.0] * n_actions,
             "displacement_scale": [1.0] * n_actions, "state_low": [-torch.inf] * n_states,
             "state_high": [torch.inf] * n_states, "state_step": [torch.inf] * n_states,
@@ -152,6 +173,8 @@ class Units(nn.Module):
         commands = trained_on.commands
         self.register_buffer("action_varies", varies, persistent=False)
         self.register_buffer("is_target", torch.tensor([c.meaning == "target" for c in commands]), persistent=False)
+        adds_up = torch.tensor([c.meaning in ("delta", "velocity") for c in commands])
+        self.register_buffer("adds_up", adds_up, persistent=False)
         scale, targets = self.displacement_scale, self.is_target  # what is -1 and 1 inside, and the most that is heard
         self.register_buffer("motion_low", torch.where(targets, -scale, self.action_low), persistent=False)
         self.register_buffer("motion_high", torch.where(targets, scale, self.action_high), persistent=False)
@@ -212,6 +235,16 @@ class Units(nn.Module):
             return state.new_full((*state.shape[:-1], len(self.action_low)), torch.nan)
         return torch.where(self._shown_by >= 0, state[..., self._shown_by.clamp(min=0)], torch.nan)
 
+    @property
+    def furthest_unanswered(self) -> Tensor:
+        """How far each command may go while the state stays as it is: (A,); infinite where that is never told."""
+        twice = 2 * (self.unanswered + torch.maximum(self.motion_low.abs(), self.motion_high.abs()))
+        return torch.where(self.action_varies & ~self.frozen, twice, torch.inf)
+
+    def unknown(self, n: int) -> Tensor:
+        """Actions of which nothing is known, NaN: (n, A)."""
+        return torch.full((n, len(self.action_low)), torch.nan, device=self.device)
+
     def first_action(self, action: Tensor) -> Tensor:
         """What counts as having led to the first frame of an episode: no motion, frozen commands as in `action`."""
         return torch.where(self.frozen, action, 0.0)
@@ -223,9 +256,7 @@ class Units(nn.Module):
 
         A target also keeps to the displacements that the data show: a larger one is a jump.
         """
-        margin = RANGE_TOLERANCE * (self.action_high - self.action_low)
-        far = (action < self.action_low - margin) | (action > self.action_high + margin)
-        low, high = self.action_low, self.action_high
+        far, low, high = self.beyond(action), self.action_low, self.action_high
         if self.has_targets:
             pose, margin = self.seen(state), RANGE_TOLERANCE * (self.displacement_high - self.displacement_low)
             nearest, furthest = pose + self.displacement_low, pose + self.displacement_high
@@ -234,6 +265,24 @@ class Units(nn.Module):
             low = torch.where(self.is_target, torch.maximum(torch.minimum(low, pose), nearest), low)
             high = torch.where(self.is_target, torch.minimum(torch.maximum(high, pose), furthest), high)
         return torch.minimum(torch.maximum(action, low), high), far.any(-1)
+
+    def beyond(self, action: Tensor) -> Tensor:
+        """Which commands (..., A) leave the data's range by more than the tolerance, wherever the robot is."""
+        margin = RANGE_TOLERANCE * (self.action_high - self.action_low)
+        return (action < self.action_low - margin) | (action > self.action_high + margin)
+
+    def leaps(self, action: Tensor, before: Sequence[Tensor]) -> Tensor:
+        """Whether commands (..., A) change faster than the data show, or change how they change: bool (...,).
+
+        Args:
+            before: the last actions, at most two, the latest last.
+        """
+        far = torch.zeros_like(action, dtype=torch.bool)
+        if len(before):
+            far |= (action - before[-1]).abs() > (1 + LEAP_TOLERANCE) * self.action_step
+        if len(before) > 1:
+            far |= (action - 2 * before[-1] + before[-2]).abs() > (1 + LEAP_TOLERANCE) * self.action_jerk
+        return far.any(-1)
 
     def hold(self, state: Tensor, told: Tensor | None = None, settled: Tensor | None = None) -> Tensor:
         """What to do when nothing can be known: stay (B, A), in robot units.

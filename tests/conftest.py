@@ -15,6 +15,7 @@ import shutil
 import threading
 import time
 
+import faulty
 import pytest
 import tiny
 import torch
@@ -36,6 +37,15 @@ def pytest_collection_modifyitems(items):
 @pytest.fixture(autouse=True)
 def seeded():
     torch.manual_seed(0)
+
+
+@pytest.fixture(autouse=True)
+def no_hurry(monkeypatch, request):
+    """Filters decide as in a simulation that waits for them, unless a test brings a clock: no machine is too slow."""
+    from lerobot_latentsafe.guard import standing_still
+    from lerobot_latentsafe.shield import Shield
+
+    monkeypatch.setattr(Shield.__init__, "__defaults__", (standing_still,))
 
 
 class VirtualTime:
@@ -155,6 +165,25 @@ def tiny_dreamer(tmp_path_factory):
     with tiny.short_blocks():
         DreamerTraining(tiny.dreamer_options(folder)).run()
     return folder
+
+
+@pytest.fixture(scope="session")
+def benches(tiny_filter, tiny_continuous_filter, tmp_path_factory):
+    """Small filters, name -> bench."""
+    folder = tmp_path_factory.mktemp("benches")
+    return {
+        "car": faulty.car_bench(tiny_filter, lookahead=3),
+        "car that forgets": faulty.car_bench(tiny_filter, lookahead=0, history_frames=4),
+        "car of continuous actions": faulty.car_bench(tiny_continuous_filter, lookahead=2, proposal_steps=2),
+        "two cameras": faulty.franka_bench(folder / "franka"),
+        "joint targets": faulty.arm_bench(folder / "arm"),
+    }
+
+
+@pytest.fixture(params=faulty.BENCHES)
+def bench(request, benches):
+    """Each small filter."""
+    return benches[request.param]
 
 
 @pytest.fixture

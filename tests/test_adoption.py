@@ -8,8 +8,8 @@ import pytest
 import torch
 from test_meanings import JOINTS, followed, moved_by, so101, uniform, walk
 
-from lerobot_latentsafe.datasets.adoption import adopt_dataset, check_candidates
-from lerobot_latentsafe.datasets.contract import Contract
+from lerobot_latentsafe.datasets.adoption import adopt_dataset, check_candidates, with_limits
+from lerobot_latentsafe.datasets.contract import Contract, DatasetContractError
 from lerobot_latentsafe.meanings import MeaningError
 from lerobot_latentsafe.units import TrainedOn, Units
 
@@ -111,3 +111,45 @@ def test_candidates_of_targets_are_displacements(arm):
     check_candidates([[0.0] * 6, [1.0, 0, 0, 0, 0, 0]], trained_on, "me/arm")
     with pytest.raises(ValueError, match="outside of what me/arm covers"):
         check_candidates([[-70.0, 0, 0, 0, 0, 0]], trained_on, "me/arm")
+
+
+@pytest.mark.parametrize("feature", ["action", "state"])
+def test_a_glitch_does_not_become_the_range(arm, feature):
+    values = getattr(arm, feature).copy()
+    values[300, 2] = 1e6
+    with pytest.raises(DatasetContractError, match=r"elbow_flex.pos of .* is 1e\+06 in frame 100 of episode 1 of"):
+        adopt_dataset(TrainedOn(), replace(arm, **{feature: values}))
+
+
+def test_a_command_that_hardly_ever_moves_is_no_glitch(arm):
+    action, state = arm.action.copy(), arm.state.copy()
+    action[:, 5] = state[:, 5] = 0.0
+    action[300, 5] = state[301, 5] = 1.0
+    assert adopt_dataset(TrainedOn(), replace(arm, action=action, state=state)).action_high[5] == 1.0
+
+
+def test_changes_of_commands_are_known(arm):
+    trained_on = adopt_dataset(TrainedOn(), arm)
+    episodes = [arm.action[arm.episode == e] for e in np.unique(arm.episode)]
+    for order, known in ((1, trained_on.action_step), (2, trained_on.action_jerk)):
+        largest = np.max([np.abs(np.diff(action, order, axis=0)).max(0) for action in episodes], 0)
+        small = 0.05 * np.subtract(trained_on.action_high, trained_on.action_low)
+        np.testing.assert_allclose(known, np.maximum(largest, small), rtol=1e-5)
+
+
+def test_how_far_commands_go_unanswered_is_known(arm):
+    state = arm.state.copy()
+    state[210:213] = state[209]  # meanwhile it does not answer
+    went = np.abs(arm.action[209:212] - arm.action[208]).max(0)
+    known = adopt_dataset(TrainedOn(), replace(arm, state=state)).unanswered
+    assert (known >= went - 1e-4).all()
+    before = adopt_dataset(TrainedOn(), arm).unanswered
+    assert (np.array(before)[:4] < 3 * np.array(adopt_dataset(TrainedOn(), arm).action_step)[:4]).all()
+
+
+def test_a_filter_of_before_learns_limits_and_keeps_what_it_knows(arm):
+    new = adopt_dataset(TrainedOn(), arm)
+    unknown = dict.fromkeys(("state_low", "state_high", "state_step", "action_step", "action_jerk", "unanswered"))
+    old = replace(new, **unknown, state_mean=[7.0] * 6)
+    assert with_limits(old, arm) == replace(new, state_mean=[7.0] * 6)
+    assert with_limits(new, replace(arm, action=2 * arm.action)) == new

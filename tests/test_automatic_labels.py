@@ -1,8 +1,10 @@
+import errno
 import json
 import shutil
 import sys
 import threading
 from http.server import BaseHTTPRequestHandler, HTTPServer
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from lerobot_latentsafe.labeling.automatic import (
     AnswerError,
     ChatEndpoint,
     LabellerError,
+    UnsavedAnswersError,
     VisionLanguageLabeller,
     as_vector,
     find_labeller,
@@ -109,6 +112,69 @@ def test_each_answer_is_saved_before_the_next_is_asked_for(labelled, root):
         run(paid)
     assert known == [0, *np.cumsum(store.length[:3])]
     assert run(lambda episode: 0)["labelled"] == [3]  # it goes on where it stopped
+
+
+@pytest.fixture
+def disk(labelled, monkeypatch):
+    """One that is full while `full` says so of the number of saves that it was asked for."""
+    _, store = labelled
+    disk, save = SimpleNamespace(full=lambda asked: False, asked=0), store._save
+
+    def may_save(specification):
+        disk.asked += 1
+        if disk.full(disk.asked):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        save(specification)
+
+    monkeypatch.setattr(store, "_save", may_save)
+    return disk
+
+
+FULL = {
+    "once": lambda asked: asked == 2,
+    "for a while": lambda asked: asked in (1, 2),
+    "at the last answer": lambda asked: asked == 4,
+}
+
+
+@pytest.mark.parametrize("full", FULL.values(), ids=FULL)
+def test_a_disk_that_was_full_for_a_while_loses_no_answer(labelled, disk, root, full, caplog):
+    run, store = labelled
+    disk.full, asked = full, []
+    assert run(lambda episode: asked.append(episode.number) or 1)["labelled"] == asked == [0, 1, 2, 3]
+    assert "kept, and tried again with the next answer" in caplog.text and "No space left" in caplog.text
+    store.close()
+    again = LabelStore(root, tiny.REPO_ID, ["entered"])
+    assert [again.verdict("entered", e).first for e in range(4)] == [1] * 4
+    again.close()
+
+
+def test_a_disk_that_stays_full_names_each_answer_and_asks_for_no_more(labelled, disk):
+    run, store = labelled
+    disk.full, asked, said = lambda n: n > 1, [], [2, 1, int(store.length[2]), np.r_[-1, np.ones(store.length[3] - 1)]]
+    with pytest.raises(
+        UnsavedAnswersError, match=r"No space left.*episode 1: fails from frame 1; episode 2: never"
+    ) as e:
+        run(lambda episode: asked.append(episode.number) or said[episode.number])
+    assert list(e.value.answers) == [1, 2, 3] and "episode 3: [-1, 1" in str(e.value) and "same command" in str(e.value)
+    disk.full = lambda n: False  # room was made
+    assert run(lambda episode: 1)["labelled"] == [1, 2, 3]
+    assert store.verdict("entered", 0).first == 2
+
+
+@pytest.mark.parametrize("ending", [KeyboardInterrupt, SystemExit, MemoryError])
+def test_what_is_unsaved_is_saved_when_the_command_is_stopped(labelled, disk, ending):
+    run, store = labelled
+    disk.full = lambda asked: asked == 1
+
+    def stopped(episode):
+        if episode.number > 0:
+            raise ending
+        return 1
+
+    with pytest.raises(LabellerError if ending is MemoryError else ending):
+        run(stopped)
+    assert store.verdict("entered", 0).first == 1
 
 
 def test_an_episode_that_fails_does_not_stop_the_others(labelled):

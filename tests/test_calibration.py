@@ -4,6 +4,7 @@ import tiny
 import torch
 
 from lerobot_latentsafe.calibration import calibrate, episode_values, store
+from lerobot_latentsafe.cli import train
 from lerobot_latentsafe.cli.options import DatasetSource, PolicySource
 from lerobot_latentsafe.cli.train import Calibrate
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
@@ -60,6 +61,40 @@ def test_one_kind_of_episode_is_not_enough(rows):
         calibrate(rows)
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("which", [0, 1], ids=["failing", "safe"])
+def test_a_value_that_is_not_finite_is_no_warning_and_no_silence(value, which):
+    rows = [FAILING, safe(0.2, 0.9), safe(0.5)]
+    rows[which] = {**rows[which], "value": np.append(rows[which]["value"][:-1], value)}
+    with pytest.raises(ValueError, match="V is not finite in 1 of 3 held-out episodes"):
+        calibrate(rows)
+
+
+NONSENSE = [
+    *(({"max_missed": value}, f"--max_missed is {value}; expected a share") for value in (1, 1.0, 1.5, -0.1, np.nan)),
+    *(({"lead_steps": value}, f"--lead_steps is {value}; expected at least 1") for value in (0, -3)),
+]
+
+
+@pytest.mark.parametrize("options, message", NONSENSE)
+def test_options_that_mean_nothing_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        calibrate([FAILING, safe(1.0)], **options)
+    with pytest.raises(ValueError, match=message):
+        Calibrate(PolicySource("no/such"), "out", **options)
+
+
+def test_a_calibration_that_breaks_off_leaves_no_filter(tiny_filter, cache_root, tmp_path, monkeypatch):
+    def killed(*given):
+        raise KeyboardInterrupt
+
+    command = Calibrate(PolicySource(str(tiny_filter)), tmp_path / "out", DatasetSource(tiny.REPO_ID, str(cache_root)))
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(train, "store", killed)
+        command.run()
+    assert not any(tmp_path.iterdir())
+
+
 def test_values_along_episodes_are_those_of_filtering(tiny_filter, cache_meta):
     policy, reader = load_with_cache(tiny_filter, cache_meta)
     rows = episode_values(policy.model, reader, np.array([2, 5]))
@@ -81,7 +116,7 @@ def test_evidence_is_kept_in_the_config(policy):
 
 def test_command_writes_a_filter_with_epsilon_and_evidence(tiny_filter, cache_root, tmp_path):
     dataset = DatasetSource(tiny.REPO_ID, str(cache_root))
-    Calibrate(PolicySource(str(tiny_filter)), tmp_path / "out", dataset, max_missed=1.0).run()
+    Calibrate(PolicySource(str(tiny_filter)), tmp_path / "out", dataset, max_missed=0.99).run()
     config = LatentSafePolicy.from_pretrained(tmp_path / "out").config
     assert config.calibration["epsilon"] == config.law.epsilon and config.trained_on.stage == "critic"
     assert config.frame_cache is None  # a folder of this machine has no business in a checkpoint

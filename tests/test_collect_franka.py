@@ -7,6 +7,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from tiny import save_franka_filter
 
 from lerobot_latentsafe.collection import franka
+from lerobot_latentsafe.collection import parts as collection_parts
 from lerobot_latentsafe.collection.franka import SOURCES, Source
 from lerobot_latentsafe.collection.franka import collect_franka as collect
 from lerobot_latentsafe.collection.interventions import BRIEF, RETREATING, Interventions
@@ -68,7 +69,7 @@ def test_several_workers_record_the_same(tiny, tmp_path, monkeypatch):
 
     alone = columns(collect("tiny", "me/tiny", tmp_path / "alone", 2, seed=0))
     # A thread in place of processes, which would not know of the tiny source.
-    monkeypatch.setattr(franka, "get_context", lambda method: SimpleNamespace(Pool=lambda workers: Pool(1)))
+    monkeypatch.setattr(collection_parts, "get_context", lambda method: SimpleNamespace(Pool=lambda workers: Pool(1)))
     together = columns(collect("tiny", "me/tiny", tmp_path / "together", 2, seed=0, workers=2))
     for name in COLUMNS:
         np.testing.assert_array_equal(together[name], alone[name])
@@ -234,14 +235,12 @@ def test_bad_requests_are_refused(tiny, tmp_path):
         collect("jar", "me/x", tmp_path / "x", 1, 0)
     with pytest.raises(ValueError, match="--workers is 0; expected at least 1"):
         collect("tiny", "me/x", tmp_path / "x", 1, 0, workers=0)
+    for n in (0, -1):
+        with pytest.raises(ValueError, match=rf"--dataset\.num_episodes is {n}; expected at least 1"):
+            collect("tiny", "me/x", tmp_path / "x", n, 0)
     (tmp_path / "precious").write_text("data")
     with pytest.raises(FileExistsError, match=r"another --dataset\.root"):
         collect("tiny", "me/x", tmp_path, 1, 0)
-    parts = tmp_path / "mine.parts"
-    parts.mkdir()
-    (parts / "of.txt").write_text("bag_mix me/other seed 1")
-    with pytest.raises(ValueError, match=r"unfinished recording of 'bag_mix me/other seed 1'.*delete it"):
-        collect("tiny", "me/x", tmp_path / "mine", 1, 0)
 
 
 def test_a_full_disk_leaves_finished_parts(tiny, tmp_path, monkeypatch):

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import threading
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,7 +19,7 @@ from lerobot_latentsafe.base_policy import BasePolicy
 from lerobot_latentsafe.cli.deploy import Push
 from lerobot_latentsafe.cli.options import PolicySource
 from lerobot_latentsafe.decision import LawOptions
-from lerobot_latentsafe.experiments.blocks import recorders
+from lerobot_latentsafe.experiments.blocks import dreamer_training, recorders
 from lerobot_latentsafe.experiments.blocks.dreamer_training import DreamerTraining, TrainDreamer
 from lerobot_latentsafe.experiments.blocks.replay import CAMERA_KEYS, Replay
 from lerobot_latentsafe.experiments.blocks.study import world_model_of
@@ -26,6 +27,7 @@ from lerobot_latentsafe.franka.actions import STATE_NAMES, action_limits
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
 from lerobot_latentsafe.policies.dreamer.modeling_dreamer import LatentSafeDreamerPolicy, WorldModelMismatchError
 from lerobot_latentsafe.runtime.checkpoint import CheckpointError
+from lerobot_latentsafe.runtime.files import FolderInUseError, OtherRunError, locked_folder
 from lerobot_latentsafe.runtime.hub import halve_weights
 from lerobot_latentsafe.safety_model import UntrainedFilterError
 from lerobot_latentsafe.training import train_reachability
@@ -107,10 +109,33 @@ def weights(folder):
     return {name: load_file(folder / name / "model.safetensors") for name in ("policy", "policy/world_model")}
 
 
-def test_a_killed_run_ends_as_one_that_was_not(trained, tmp_path):
-    class Killed(Exception):
-        pass
+class Killed(BaseException):
+    pass
 
+
+def killed(*given, **options):
+    raise Killed
+
+
+def log_of(folder):
+    rows = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+    return [{name: value for name, value in row.items() if name != "cpu_s"} for row in rows]
+
+
+def same_run(folder, trained):
+    """Whether a run left what another left, to the last bit."""
+    for name, expected in weights(trained).items():
+        found = weights(folder)[name]
+        assert found.keys() == expected.keys()
+        assert all(torch.equal(found[key], expected[key]) for key in expected), name
+    for name in (*CAMERA_KEYS, "action", "terms"):
+        np.testing.assert_array_equal(*(np.load(f / "replay" / f"{name}.npy") for f in (folder, trained)))
+    assert log_of(folder) == log_of(trained)
+    assert sorted(p.name for p in folder.iterdir()) == sorted(p.name for p in trained.iterdir())
+    assert [p.name for p in (folder / "checkpoints").iterdir()] == [f"{tiny.dreamer_options(folder).steps:07d}"]
+
+
+def test_a_killed_run_ends_as_one_that_was_not(trained, tmp_path):
     folder = tmp_path / "run"
     run = DreamerTraining(tiny.dreamer_options(folder))
     update = run.update
@@ -124,15 +149,51 @@ def test_a_killed_run_ends_as_one_that_was_not(trained, tmp_path):
     with pytest.raises(Killed):
         run.run()
     assert [p.name for p in (folder / "checkpoints").iterdir()] == ["0000004"]
+    with (folder / "log.jsonl").open("a") as log:
+        log.write('{"step": 5, "cp')  # torn by the kill
     resumed = DreamerTraining(tiny.dreamer_options(folder))
     assert resumed.step == 4
     resumed.run()
-    for name, expected in weights(trained).items():
-        found = weights(folder)[name]
-        assert found.keys() == expected.keys()
-        assert all(torch.equal(found[key], expected[key]) for key in expected), name
-    for name in (*CAMERA_KEYS, "action", "terms"):
-        np.testing.assert_array_equal(*(np.load(f / "replay" / f"{name}.npy") for f in (folder, trained)))
+    same_run(folder, trained)
+
+
+KILLS = ["claim", "save_optimizer_state", "discard", "export", "Recorders", "LatentSafeDreamerPolicy"]
+
+
+@pytest.mark.parametrize("step", KILLS)
+def test_a_run_killed_while_it_writes_ends_as_one_that_was_not(trained, tmp_path, monkeypatch, step):
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(dreamer_training, step, killed)
+        DreamerTraining(tiny.dreamer_options(tmp_path / "run")).run()
+    DreamerTraining(tiny.dreamer_options(tmp_path / "run")).run()
+    same_run(tmp_path / "run", trained)
+
+
+def test_a_note_torn_by_a_kill_is_told_and_the_rest_goes_on(trained, tmp_path):
+    folder = shutil.copytree(trained, tmp_path / "run")
+    (folder / "options.json").write_text("")
+    with pytest.raises(OtherRunError, match=r"options\.json .* not readable .*remove this one file"):
+        DreamerTraining(tiny.dreamer_options(folder))
+    (folder / "options.json").unlink()
+    assert DreamerTraining(tiny.dreamer_options(folder)).step == 7
+
+
+def test_two_at_once_are_told_apart(tmp_path):
+    entered, left = threading.Event(), threading.Event()
+
+    def other():
+        with locked_folder(tmp_path / "run"):
+            entered.set()
+            left.wait()
+
+    thread = threading.Thread(target=other)
+    thread.start()
+    entered.wait()
+    with pytest.raises(FolderInUseError, match=r"is writing .*run already"):
+        tiny.dreamer_options(tmp_path / "run").run()
+    left.set()
+    thread.join()
+    assert not (tmp_path / "run").exists()
 
 
 def test_other_workers_record_the_same_episodes(monkeypatch):
@@ -158,7 +219,7 @@ def test_step_sizes_rise_at_first_and_fall_to_nothing_over_the_last_fifth(traine
 
 
 def test_resuming_with_other_options_is_refused(trained):
-    with pytest.raises(ValueError, match="run with other options \\(batch_size\\)"):
+    with pytest.raises(ValueError, match="run with other options \\(batch_size = 4\\)"):
         DreamerTraining(tiny.dreamer_options(trained, batch_size=5))
 
 
@@ -250,7 +311,16 @@ def test_replay_of_another_size_is_refused(tmp_path):
         Replay.open(tmp_path, 3, 60, 16)
 
 
-@pytest.mark.parametrize("changes, message", [({"pretraining": 9}, "pretraining is 9"), ({"model": 0}, "model.type")])
+NONSENSE = {
+    "pretraining": 9, "steps": 0, "demonstrations": 0, "collect_every": 0, "n_envs": -1, "batch_size": 0,
+    "save_every": 0, "log_every": 0, "workers": -1, "seed": -1, "demonstration_share": float("nan"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [({"model": 0}, "model.type"), *(({name: value}, f"--{name} is {value}") for name, value in NONSENSE.items())],
+)
 def test_bad_options_are_refused(tmp_path, changes, message):
     if "model" in changes:
         changes = {"model": tiny.dreamer_options(tmp_path).policy}

@@ -1,5 +1,7 @@
 import copy
+import errno
 import json
+import os
 import shutil
 
 import numpy as np
@@ -11,6 +13,7 @@ import torch
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from lerobot_latentsafe.datasets import build_cache
 from lerobot_latentsafe.datasets.build_cache import build_frame_cache
 from lerobot_latentsafe.datasets.frame_cache import FrameCache, FrameCacheError, dataset_fingerprint
 from lerobot_latentsafe.datasets.labels import FailureLabels
@@ -145,7 +148,7 @@ def test_manifest_is_written_last(dataset_root, tmp_path, monkeypatch):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("lerobot_latentsafe.datasets.build_cache.os.replace", interrupted)
+    monkeypatch.setattr("lerobot_latentsafe.datasets.build_cache._finish", interrupted)
     with pytest.raises(KeyboardInterrupt):
         build_frame_cache(LeRobotDataset(tiny.REPO_ID, root=dataset_root), tmp_path / "cache", 8)
     assert not (tmp_path / "cache" / "frame_cache" / "manifest.json").exists()
@@ -169,6 +172,52 @@ def test_manifest_of_another_shape_is_a_clear_error(torn):
     manifest.write_text(json.dumps({"version": 1}))
     with pytest.raises(FrameCacheError):
         tiny.new_policy(tiny.metadata(torn))
+
+
+@pytest.mark.parametrize(
+    "step", ["_without_cameras", "allocate", "_layout", "_write", "_await_layout", "_array", "_finish"]
+)
+@pytest.mark.parametrize("episodes", [None, [1, 3]], ids=["all", "some"])
+def test_build_killed_at_any_step_ends_as_one_that_was_not(dataset_root, tmp_path, monkeypatch, step, episodes):
+    dataset = LeRobotDataset(tiny.REPO_ID, root=dataset_root)
+
+    def killed(*_, **__):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(build_cache, step, killed)
+        build_frame_cache(dataset, tmp_path / "cut", 8, episodes=episodes)
+    build_frame_cache(dataset, tmp_path / "cut", 8, episodes=episodes)
+    build_frame_cache(dataset, tmp_path / "whole", 8, episodes=episodes)
+    files = [
+        {p.relative_to(root): p.read_bytes() for p in root.rglob("*.npy")} for root in sorted(tmp_path.glob("[cw]*"))
+    ]
+    assert files[0] == files[1] and FrameCache.open(tmp_path / "cut", tiny.metadata(tmp_path / "cut"))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["cut", "whole"]
+
+
+def test_a_full_disk_is_an_error_before_any_frame_is_decoded(dataset_root, tmp_path, monkeypatch):
+    """Writing to a page of a memory map that has no room on the disk would kill the process."""
+
+    def full(descriptor, offset, size):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    dataset = LeRobotDataset(tiny.REPO_ID, root=dataset_root)
+    with (
+        monkeypatch.context() as patch,
+        pytest.raises(OSError, match=r"No space left.* are free\. Make room and start"),
+    ):
+        patch.setattr(os, "posix_fallocate", full, raising=False)
+        patch.setattr(build_cache.Sight, "pieces", None)
+        build_frame_cache(dataset, tmp_path / "cache", 8)
+    assert not (tmp_path / "cache").exists()
+    build_frame_cache(dataset, tmp_path / "cache", 8)
+
+
+@pytest.mark.parametrize("size", [0, -1])
+def test_pictures_of_no_size_are_refused(dataset_root, tmp_path, size):
+    with pytest.raises(ValueError, match=f"--image_size is {size}; expected at least 1"):
+        build_frame_cache(LeRobotDataset(tiny.REPO_ID, root=dataset_root), tmp_path / "cache", size)
 
 
 def test_existing_folder_is_left_alone(dataset_root, tmp_path):

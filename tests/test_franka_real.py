@@ -1,116 +1,34 @@
-"""The real Franka's robot class against a fake driver that lags, stops and loses its gripper."""
+"""The real Franka's robot class against a stand-in driver that lags, stops and loses its gripper."""
 
 import logging
-import threading
 import time
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from franka_stand_in import START, STILL, connected, make, standing_clock, stepping, wait_for
 from lerobot.robots.utils import make_robot_from_config
 from lerobot.utils.errors import DeviceNotConnectedError
 
-from lerobot_latentsafe.franka.actions import ACTION_NAMES, GRIPPER_WIDTH, HOME, JOINT_NAMES, STATE_NAMES
-from lerobot_latentsafe.robots.franka import franka
+from lerobot_latentsafe.franka.actions import ACTION_NAMES, HOME, JOINT_NAMES, STATE_NAMES
 from lerobot_latentsafe.robots.franka.config_franka import LatentSafeFrankaConfig
-from lerobot_latentsafe.robots.franka.driver import ArmState, FrankaError, FrankyDriver, GripperError
-from lerobot_latentsafe.robots.franka.franka import DOWN, STREAM_HZ, LatentSafeFranka
-
-STILL = dict.fromkeys(ACTION_NAMES, 0.0) | {"gripper.pos": 1.0}
-START = np.array([0.45, 0.0, 0.30])
-
-
-class FakeDriver:
-    """An arm that covers a share of the way to its target with every call of `track`.
-
-    `reflex`: the arm has stopped until `recover`. `blocked`: it cannot move. `gripper_lost`: the hand is silent.
-    """
-
-    def __init__(self, follow: float = 0.3):
-        self.follow, self.joints = follow, HOME.copy()
-        self.position, self.rotation, self.width = START.copy(), DOWN, GRIPPER_WIDTH
-        self.tracked: list[np.ndarray] = []
-        self.calls: list[str] = []
-        self.started = self.reflex = self.blocked = self.gripper_lost = False
-        self.lock = threading.Lock()
-
-    def connect(self):
-        self.calls.append("connect")
-
-    def start(self):
-        self.calls.append("start")
-        self.started = True
-
-    def state(self):
-        if self.reflex:
-            raise FrankaError("cartesian reflex")
-        if self.gripper_lost:
-            raise GripperError("the gripper does not answer")
-        with self.lock:
-            return ArmState(self.joints.copy(), self.position.copy(), self.rotation, self.width)
-
-    def track(self, position, rotation):
-        if self.reflex:
-            raise FrankaError("cartesian reflex")
-        with self.lock:
-            self.tracked.append(position)
-            if not self.blocked:
-                self.position = self.position + self.follow * (position - self.position)
-                self.rotation = rotation
-
-    def move_joints(self, joints):
-        self.calls.append("move_joints")
-        self.joints = joints.copy()
-
-    def move_gripper(self, width):
-        self.calls.append(f"gripper {width:.3f}")
-        self.width = width
-
-    def recover(self):
-        self.calls.append("recover")
-        self.reflex = False
-
-    def stop(self):
-        self.calls.append("stop")
-        self.started = False
-
-    def disconnect(self):
-        self.calls.append("disconnect")
-
-
-def make(driver=None, **options):
-    return LatentSafeFranka(LatentSafeFrankaConfig(ip="172.16.0.2", **options), driver or FakeDriver())
+from lerobot_latentsafe.robots.franka.driver import FrankaError, FrankyDriver, GripperError
+from lerobot_latentsafe.robots.franka.franka import DOWN, LatentSafeFranka
 
 
 @pytest.fixture
 def clock(monkeypatch):
-    """The robot's clock. It stands, so that no test is too slow for it; once it `runs`, each streamed pose moves it."""
-    clock, track = SimpleNamespace(now=0.0, runs=False, monotonic=lambda: clock.now), FakeDriver.track
-
-    def timed(self, position, rotation):
-        clock.now += clock.runs / STREAM_HZ
-        track(self, position, rotation)
-
-    monkeypatch.setattr(FakeDriver, "track", timed)
-    monkeypatch.setattr(franka, "time", clock)
-    return clock
+    return standing_clock(monkeypatch)
 
 
 @pytest.fixture
 def robot(clock):
-    made = make()
-    made.connect()
-    yield made
-    if made.is_connected:
-        made.driver.reflex = made.driver.gripper_lost = False
-        made.disconnect()
+    with connected() as robot:
+        yield robot
 
 
-def wait_for(condition, seconds=60.0):
-    until = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < until, "did not happen in time"
-        time.sleep(0.005)
+@pytest.fixture
+def step(robot, clock):
+    return stepping(robot, clock)
 
 
 def test_features_are_the_simulations(robot):
@@ -131,19 +49,17 @@ def test_a_delta_is_streamed_smoothly(robot, clock):
     assert steps.max() < 0.02 and steps.min() > -1e-9  # in between, not in one jump
 
 
-def test_the_commanded_pose_stays_in_the_workspace_and_near_the_arm(robot):
+def test_the_commanded_pose_stays_in_the_workspace_and_near_the_arm(robot, step):
     robot.driver.blocked = True
     for _ in range(5):
-        robot.send_action(STILL | {"delta_x.pos": 0.03, "delta_rz.pos": 0.13})
+        step(delta_x=0.03, delta_rz=0.13)
     position, rotation = robot._stream.target()
     assert position[0] == pytest.approx(START[0] + robot.config.max_lead)
     assert (rotation * DOWN.inv()).magnitude() == pytest.approx(robot.config.max_lead_turn)
     robot.driver.position = np.array([0.45, 0.0, 0.03])
-    sent = robot.send_action(STILL | {"delta_z.pos": -0.03})
-    for _ in range(3):
-        robot.send_action(STILL | {"delta_z.pos": -0.03})
+    sent = [step(delta_z=-0.03)["delta_z.pos"] for _ in range(30)]
     assert robot._stream.target()[0][2] == pytest.approx(robot.config.workspace_low[2])
-    assert sent["delta_z.pos"] == pytest.approx(0.03 + 0.04 - 0.30)  # what was commanded, not what was asked
+    assert sum(sent) == pytest.approx(robot.config.workspace_low[2] - 0.30)  # what was commanded, not what was asked
 
 
 def test_without_new_actions_the_arm_holds(robot, clock, caplog):
@@ -248,12 +164,25 @@ def test_an_error_in_the_middle_of_an_episode_keeps_the_recording(robot, tmp_pat
     assert LeRobotDataset("me/real", root=tmp_path / "real").num_frames == 5
 
 
-def test_broken_actions_move_nothing(robot):
+@pytest.mark.parametrize(
+    ("broken", "message"),
+    [
+        (STILL | {"delta_x.pos": np.nan}, "non-finite"),
+        ({"delta_x": 1.0}, r"expected delta_x\.pos"),
+        ({}, r"has the names \(none\)"),
+        (None, "does not name numbers"),
+        (STILL | {"delta_x.pos": None}, "does not name numbers"),
+        (STILL | {"delta_x.pos": "fast"}, "does not name numbers"),
+        (STILL | {"delta_x.pos": np.zeros(2)}, "does not name numbers"),
+    ],
+    ids=str,
+)
+def test_broken_actions_move_nothing(robot, broken, message):
     before = robot._stream.target()[0].copy()
-    for broken in (STILL | {"delta_x.pos": float("nan")}, {"delta_x": 1.0}):
-        with pytest.raises(ValueError, match=r"non-finite|expected delta_x\.pos"):
-            robot.send_action(broken)
+    with pytest.raises(ValueError, match=message):
+        robot.send_action(broken)
     np.testing.assert_array_equal(robot._stream.target()[0], before)
+    assert robot.send_action(STILL)  # the arm is well
 
 
 def test_an_unconnected_robot_says_so():
@@ -284,7 +213,15 @@ def test_a_camera_of_another_size_is_refused(robot):
     "options, message",
     [
         ({"workspace_low": (0.8, 0, 0)}, "must be below workspace_high"),
+        ({"workspace_low": (np.nan, 0, 0)}, "both finite"),
+        ({"workspace_high": (np.inf, 1, 1)}, "both finite"),
         ({"stiffness": -1.0}, "stiffness is -1"),
+        ({"max_lead": np.nan}, "max_lead is nan"),
+        ({"watchdog": np.inf}, "watchdog is inf"),
+        ({"force_threshold": 0.0}, "force_threshold is 0"),
+        ({"fps": 0}, "fps is 0"),
+        ({"tool_offset": np.nan}, "tool_offset is nan"),
+        ({"max_recoveries": -1}, "max_recoveries is -1"),
         ({"watchdog": 0.05}, r"watchdog is 0\.05 s; at 15 Hz expected at least 0\.100 s"),
     ],
 )

@@ -8,10 +8,10 @@ import tiny
 import torch
 
 from lerobot_latentsafe.decision import Reason
-from lerobot_latentsafe.evaluation.faults import BROKEN, FAULTS
+from lerobot_latentsafe.evaluation.faults import BROKEN, FAULTS, FAULTS_OF_DEGREES
+from lerobot_latentsafe.guard import UnknownPoseError
 from lerobot_latentsafe.meanings import MeaningError
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
-from lerobot_latentsafe.shield import UnknownPoseError
 
 PICTURE, STATE = "observation.images.front", "observation.state"
 POSE = torch.tensor([tiny.ARM_POSE])
@@ -53,6 +53,7 @@ def shows(number):
 
 GIVEN = {
     **FAULTS,
+    **FAULTS_OF_DEGREES,
     "a joint in another unit": shows(math.radians(-71) * 100),
     "a jump of twenty degrees": proposes(20, 0, 0),
     "a target beyond the data": proposes(0, 0, 45),

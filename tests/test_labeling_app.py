@@ -7,6 +7,7 @@ import shutil
 import socket
 import string
 import struct
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -125,6 +126,14 @@ def test_disk_that_is_full_is_told(client, server, monkeypatch):
     monkeypatch.setattr(server.store, "_save", full)
     answer = label(client, 3, 2)
     assert answer.status_code == 507 and "No space left" in answer.json()["error"]
+
+
+def test_an_episode_without_a_suggestion_says_why(client, server):
+    server.suggester = SimpleNamespace(known={}, why_silent={3: "joint_2 is nan in frame 7"}.get)
+    entries = ask(client, "api/labels/spilled").json()["entries"]
+    assert entries[3]["silent"] == "joint_2 is nan in frame 7" and "silent" not in entries[2]
+    assert ask(client, "api/margin/3").json() == {"margin": None}
+    assert label(client, 3, 2).status_code == 200  # a person labels it
 
 
 @pytest.mark.parametrize("token", ["", "wrong", "right-toke", "right-token2", "%2e%2e", "right%2Dtoken/../wrong"])

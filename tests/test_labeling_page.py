@@ -153,6 +153,24 @@ def test_ten_episodes_by_keyboard_reload_and_undo(server, browser):
         assert verdicts(server, "dropped") == [None] * 12
 
 
+def test_an_episode_without_a_suggestion_says_why(server, browser):
+    def silence(route):
+        answer = route.fetch()
+        told = answer.json()
+        for entry in told["entries"][3:4]:
+            entry["silent"] = "<b>joint_2</b> is nan"
+        route.fulfill(response=answer, json=told)
+
+    context = browser.new_context()
+    context.route("**/api/labels/spilled", silence)
+    with opened(browser, server.address, context) as page:
+        title = page.get_attribute("#episodes li[data-episode='3']", "title")
+        assert title.endswith("no suggestion, because <b>joint_2</b> is nan")
+        page.click("#episodes li[data-episode='3']")
+        assert shown(page) == 3  # the time line says the same
+    context.close()
+
+
 PICTURES_AGREE = """([episode, index]) => Promise.all([...document.querySelectorAll('#cameras canvas')].map(
   async (canvas, camera) => {
     const content = await (await fetch(`api/frames/${camera}/${episode}`)).arrayBuffer();

@@ -12,7 +12,8 @@ import pytest
 import tiny
 
 from lerobot_latentsafe.datasets import labels as label_files
-from lerobot_latentsafe.datasets.labels import METADATA, FailureLabels, LabelFileError, UnlabelledDatasetError
+from lerobot_latentsafe.datasets.label_file import METADATA
+from lerobot_latentsafe.datasets.labels import FailureLabels, LabelFileError, UnlabelledDatasetError
 from lerobot_latentsafe.labeling.store import ConflictError, LabelStore, first_failing
 
 
@@ -165,6 +166,66 @@ def test_what_another_process_saved_last_is_read(store, root):
     store.label("spilled", 3, 2, "ann")
     with pytest.raises(OSError, match="another process"):
         LabelStore(root, tiny.REPO_ID, ["spilled"])
+    store.label("spilled", 4, 1, "ann")
+    again = reopened(store)
+    assert [again.verdict("spilled", e).first for e in (3, 4)] == [2, 1]
+    again.close()
+
+
+@pytest.fixture
+def intruder(store, root, tmp_path):
+    """Labels an episode in a copy and puts its file in place of the store's: the lock does not hold on each disk."""
+
+    def write(episode, first, by="bo"):
+        copy = shutil.copytree(root, tmp_path / f"copy of {episode}", ignore=shutil.ignore_patterns(".lock"))
+        other = LabelStore(copy, tiny.REPO_ID, ["spilled"])
+        other.label("spilled", episode, first, by)
+        other.close()
+        shutil.copy(copy / "labels" / "spilled.parquet", root / "labels" / "spilled.parquet")
+
+    return write
+
+
+CHANGES = {
+    "label": lambda store: store.label("spilled", 5, 1, "ann"),
+    "label_frames": lambda store: store.label_frames("spilled", {5: np.r_[0, np.ones(store.length[5] - 1)]}, "auto"),
+    "take": lambda store: store.take("spilled", store._files["failure"]),
+    "undo": lambda store: store.undo("spilled"),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
+def test_what_another_program_saved_in_spite_of_the_lock_is_never_overwritten(store, intruder, change, caplog):
+    store.label("spilled", 3, 2, "ann")
+    store.label("spilled", 6, 0, "ann")
+    intruder(4, 1)
+    change(store)
+    assert "another program wrote to" in caplog.text
+    again = reopened(store)
+    assert [again.verdict("spilled", e).first for e in (3, 4)] == [2, 1] and again.verdict("spilled", 4).by == "bo"
+    again.close()
+
+
+def test_an_episode_that_another_program_labelled_is_a_conflict(store, intruder):
+    seen = store.verdict("spilled", 4).at
+    intruder(4, 1)
+    with pytest.raises(ConflictError, match="changed by bo"):
+        store.label("spilled", 4, 0, "ann", seen)
+    assert store.verdict("spilled", 4).first == 1
+
+
+def test_a_file_that_another_program_broke_is_not_overwritten(store, root):
+    store.label("spilled", 3, 2, "ann")
+    (root / "labels" / "spilled.parquet").write_bytes(b"PAR1 torn")
+    with pytest.raises(OSError, match=r"another program wrote to .*spilled.parquet meanwhile, and the label was not"):
+        store.label("spilled", 4, 1, "ann")
+    assert (root / "labels" / "spilled.parquet").read_bytes() == b"PAR1 torn"
+    assert store.verdict("spilled", 4).first is None
+
+
+def test_labels_whose_file_was_taken_away_are_written_again(store, root):
+    store.label("spilled", 3, 2, "ann")
+    (root / "labels" / "spilled.parquet").unlink()
     store.label("spilled", 4, 1, "ann")
     again = reopened(store)
     assert [again.verdict("spilled", e).first for e in (3, 4)] == [2, 1]

@@ -1,9 +1,23 @@
+import json
+from datetime import UTC, datetime
+
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from lerobot_latentsafe.datasets.labels import FAILING, SAFE, UNLABELLED, FailureLabels, UnlabelledDatasetError
+from lerobot_latentsafe.datasets.label_file import METADATA
+from lerobot_latentsafe.datasets.label_places import LabelFileError
+from lerobot_latentsafe.datasets.labels import (
+    FAILING,
+    SAFE,
+    UNLABELLED,
+    Content,
+    FailureLabels,
+    Sidecar,
+    UnlabelledDatasetError,
+)
 from lerobot_latentsafe.datasets.reading import BrokenFileError
+from lerobot_latentsafe.labeling.store import LabelStore
 
 N = 6
 
@@ -130,3 +144,104 @@ def test_metadata_of_another_length_is_refused(cache_root, cache_meta, monkeypat
     monkeypatch.setattr(cache_meta.info, "total_frames", cache_meta.total_frames + 1)
     with pytest.raises(ValueError, match="frames on disk"):
         tiny.new_policy(cache_meta)
+
+
+# -- label files that were damaged or made by other tools ---
+
+
+def sidecar(root, metadata=None, entries=None, **columns):
+    """A label file as `latentsafe label` writes it, with other metadata, entries of it or columns."""
+    write_dataset(root, action=[[0.1 * i] for i in range(N)])
+    path, content = root / "labels" / "failure.parquet", Content(root)
+    path.parent.mkdir(exist_ok=True)
+    labels = Sidecar.empty(N)
+    labels.failure[:] = [0, 1] * 3
+    labels.write(path, "me/car", content)
+    table = pq.read_table(path)
+    told = metadata
+    if told is None:
+        told = json.dumps(json.loads(table.schema.metadata[METADATA]) | (entries or {}))
+    for name, values in columns.items():
+        array = values if isinstance(values, pa.Array) else pa.array(list(values))
+        table = table.set_column(table.schema.get_field_index(name), name, array)
+    pq.write_table(table.replace_schema_metadata({METADATA: told}), path)
+    return path
+
+
+TIMES = pa.array([datetime(2024, 5, 6)] * N)
+READ = {
+    "as it was written": {},
+    "names as plain text": {"labelled_by": ["ann"] * N},
+    "nobody": {"labelled_by": pa.nulls(N)},
+    "times of another precision": {"labelled_at": TIMES.cast(pa.timestamp("ns"))},
+    "times as whole numbers": {"labelled_at": TIMES.cast(pa.timestamp("us")).cast(pa.int64())},
+    "no times": {"labelled_at": pa.nulls(N)},
+    "index of few bits": {"index": pa.array(range(N), pa.uint8())},
+    "labels as fractions": {"failure": [0.0, 1.0] * 3},
+    "labels as truths": {"failure": [False, True] * 3},
+}
+
+
+@pytest.mark.parametrize("changes", READ.values(), ids=READ)
+def test_label_files_of_other_tools_are_read(tmp_path, changes):
+    read = Sidecar.read(sidecar(tmp_path, **changes), Content(tmp_path))
+    assert read.failure.tolist() == [0, 1] * 3
+    if "labelled_at" in changes and changes["labelled_at"].null_count == 0:
+        assert set(read.at) == {int(datetime(2024, 5, 6, tzinfo=UTC).timestamp() * 1e6)}
+
+
+BROKEN = {
+    "metadata no JSON": ({"metadata": b"{schema: 2"}, "does not tell its dataset in JSON"),
+    "metadata no text": ({"metadata": b"\xff\xfe\x00"}, "does not tell its dataset in JSON"),
+    "metadata nested": ({"metadata": b"[" * 100_000}, "does not tell its dataset in JSON"),
+    "metadata a list": ({"metadata": b"[]"}, "expected a JSON object"),
+    "metadata null": ({"metadata": b"null"}, "expected a JSON object"),
+    "no schema": ({"entries": {"schema": None}}, "has schema None, this version reads 1 and 2"),
+    "schema to come": ({"entries": {"schema": 3}}, "has schema 3, this version reads 1 and 2"),
+    "no frames": ({"entries": {"frames": None}}, "tells frames None of its dataset; expected a whole number"),
+    "frames in words": ({"entries": {"frames": "many"}}, "tells frames 'many' of its dataset; expected a whole number"),
+    "frames negative": ({"entries": {"frames": -1}}, "tells frames -1"),
+    "frames a fraction": ({"entries": {"frames": 6.0}}, r"tells frames 6\.0"),
+    "too many frames": ({"entries": {"frames": 10**15}}, "expected the same numbers"),
+    "identity a number": ({"entries": {"identity": 5}}, "tells identity 5 of its dataset; expected a text"),
+    "repo_id a list": ({"entries": {"repo_id": ["me"]}}, r"tells repo_id \['me'\]"),
+    "columns a text": ({"entries": {"columns": "action"}}, "expected a list of texts"),
+    "lengths of texts": ({"entries": {"lengths": ["3", "3"]}}, "expected a list of whole numbers"),
+    "lengths missing": ({"entries": {"lengths": None}}, "tells lengths None"),
+    "lengths negative": ({"entries": {"lengths": [-3, 9]}}, "expected a list of whole numbers"),
+    "one length too few": ({"entries": {"lengths": [6]}}, "tells 1 lengths of 2 episodes"),
+    "episodes of numbers": ({"entries": {"episodes": [1, 2]}}, "expected a list of texts"),
+    "index a fraction": ({"index": [float(i) for i in range(N)]}, "holds double in its column 'index'; expected whole"),
+    "index with a hole": ({"index": [0, 1, 2, None, 4, 5]}, "column 'index'; expected whole numbers, none missing"),
+    "index in words": ({"index": list("012345")}, "holds string in its column 'index'"),
+    "index of lists": ({"index": [[i] for i in range(N)]}, "in its column 'index'"),
+    "labels of lists": ({"failure": [[0], [0, 1], [], [1], [0], [1]]}, "expected 1, 0 or -1"),
+    "labels in words": ({"failure": ["safe"] * N}, "holds safe; expected 1, 0 or -1"),
+    "labels as times": ({"failure": pa.array([1, 0] * 3, pa.timestamp("ns"))}, "expected 1, 0 or -1"),
+    "labels as records": ({"failure": [{"label": 1}] * N}, "expected 1, 0 or -1"),
+    "names of lists": ({"labelled_by": [["ann"]] * N}, "in its column 'labelled_by'; expected names"),
+    "names of numbers": ({"labelled_by": [1] * N}, "holds int64 in its column 'labelled_by'; expected names"),
+    "times in words": ({"labelled_at": ["today"] * N}, "holds string in its column 'labelled_at'; expected times"),
+    "times of lists": ({"labelled_at": [[1]] * N}, "in its column 'labelled_at'; expected times"),
+    "times negative": ({"labelled_at": [-1] * N}, "tells times from -1 to -1"),
+    "times past any clock": ({"labelled_at": [2**62] * N}, "expected microseconds since 1970"),
+}
+
+
+@pytest.mark.parametrize(("changes", "message"), BROKEN.values(), ids=BROKEN)
+def test_a_broken_label_file_says_what_is_wrong_and_stays(tmp_path, changes, message):
+    path = sidecar(tmp_path, **changes)
+    kept = path.read_bytes()
+    for use in (lambda: FailureLabels.load(tmp_path), lambda: LabelStore(tmp_path, "me/car", ["failure"])):
+        with pytest.raises(LabelFileError, match=message) as refused:
+            use()
+        assert str(path) in str(refused.value)
+    assert path.read_bytes() == kept
+
+
+def test_a_column_twice_is_refused(tmp_path):
+    path = sidecar(tmp_path)
+    table = pq.read_table(path)
+    pq.write_table(table.append_column("index", table["index"]), path)
+    with pytest.raises(LabelFileError, match="has 2 columns 'index'; expected one"):
+        FailureLabels.load(tmp_path)

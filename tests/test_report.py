@@ -1,3 +1,5 @@
+import errno
+import os
 import re
 from types import SimpleNamespace
 
@@ -41,6 +43,20 @@ def test_report_on_a_recording_without_a_filter_is_refused(tiny_filter, tmp_path
     with pytest.raises(ValueError, match="me/cup was not recorded under a filter"):
         write_filter_report(tmp_path / "report.html", policy, None, 2, 0, plain)
     assert not (tmp_path / "report.html").exists()
+
+
+@pytest.mark.parametrize("failure", [KeyboardInterrupt, OSError(errno.ENOSPC, "No space left on device")])
+def test_a_report_that_breaks_off_leaves_the_one_before(tmp_path, monkeypatch, failure):
+    def breaks(descriptor):
+        raise failure
+
+    path = tmp_path / "report.html"
+    html.write_report(path, "before", [])
+    before = path.read_text()
+    with monkeypatch.context() as patch, pytest.raises((KeyboardInterrupt, OSError)):
+        patch.setattr(os, "fsync", breaks)
+        html.write_report(path, "after", [])
+    assert path.read_text() == before and [p.name for p in tmp_path.iterdir()] == ["report.html"]
 
 
 class Still(BasePolicy):

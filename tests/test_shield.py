@@ -1,4 +1,5 @@
 import math
+import re
 from dataclasses import replace
 
 import pytest
@@ -188,7 +189,8 @@ def test_image_of_other_proportions_is_refused(permissive, shape):
 
 
 def test_image_of_another_size_is_averaged(permissive):
-    observation = {**along(1)[0], IMAGE: torch.rand(3, 3, 64, 64)}
+    seen = along(1)[0]
+    observation = {**seen, IMAGE: seen[IMAGE].repeat_interleave(2, -1).repeat_interleave(2, -2)}
     assert permissive.shield(observation, actions(LEFT)).reason.eq(Reason.PASSED).all()
 
 
@@ -231,9 +233,10 @@ def test_float_error_is_not_out_of_range(permissive):
 
 
 @pytest.mark.parametrize("shape", [(3, 1), (3, 7), (2, 2), (3,)])
-def test_action_of_another_shape_names_both(permissive, shape):
-    with pytest.raises(ValueError, match=r"shape \(.*expected \(3, 2\).*turn_rate.vel, speed.vel"):
-        permissive.shield(along(1)[0], torch.zeros(shape))
+def test_action_of_another_shape_is_no_action_and_the_log_names_both(permissive, shape, caplog):
+    decision = permissive.shield(along(1)[0], torch.zeros(shape))
+    assert decision.reason.eq(Reason.BASE_POLICY_FAILED).all() and decision.intervened.all()
+    assert re.search(r"shape \(.*expected a tensor of shape \(3, 2\).*turn_rate.vel, speed.vel", caplog.text)
 
 
 def test_no_action_at_all_falls_back(permissive):
@@ -322,7 +325,7 @@ def test_after_some_overrides_the_retreat_acts_and_goes_on(restless):
     config, shield = restless.config, restless.shield
     config.law.retreat, config.law.retreat_after, config.law.min_retreat_steps = RETREAT, 2, 3
     one = actions(OUTSIDE, LEFT, LEFT)
-    for proposed, acts, retreat in (
+    for seen, (proposed, acts, retreat) in zip(along(8), (
         (one, True, False),  # the critic's action is tried twice,
         (actions(LEFT), False, False),
         (one, True, False),
@@ -331,8 +334,8 @@ def test_after_some_overrides_the_retreat_acts_and_goes_on(restless):
         (actions(LEFT), True, True),
         (actions(LEFT), False, False),
         (one, True, True),  # and again, for that is not long ago
-    ):
-        decision = shield(along(1)[0], proposed)
+    )):  # fmt: skip
+        decision = shield(seen, proposed)
         assert decision.intervened.tolist() == [acts, False, False]
         assert retreats(decision) == [retreat, False, False]
     shield.reset()
@@ -343,10 +346,11 @@ def test_overrides_of_long_ago_do_not_count(restless):
     restless.config.law.retreat, restless.config.law.retreat_after = RETREAT, 1
     for pause, retreat in ((8, True), (10, False)):
         restless.shield.reset()
-        restless.shield(along(1)[0], actions(OUTSIDE))
-        for _ in range(pause):
-            assert not restless.shield(along(1)[0], actions(LEFT)).intervened.any()
-        assert retreats(restless.shield(along(1)[0], actions(OUTSIDE))) == [retreat] * 3
+        first, *between, last = along(pause + 2)
+        restless.shield(first, actions(OUTSIDE))
+        for seen in between:
+            assert not restless.shield(seen, actions(LEFT)).intervened.any()
+        assert retreats(restless.shield(last, actions(OUTSIDE))) == [retreat] * 3
 
 
 def test_retreat_is_a_move_of_the_fallback_not_of_v(tiny_continuous_filter):

@@ -39,6 +39,7 @@ GROUPS = {
     "evaluate": "ask what it is worth",
 }
 _RECORD, _DATASET, _LABEL, _TRAIN, _DEPLOY, _EVALUATE = (f"lerobot_latentsafe.cli.{group}" for group in GROUPS)
+_GUARD = "lerobot_latentsafe.cli.guard"
 _DREAMER = "lerobot_latentsafe.experiments.blocks.dreamer_training"
 
 VERBS: dict[str, Verb] = {
@@ -66,6 +67,7 @@ VERBS: dict[str, Verb] = {
     "write-labels": Verb(
         "label", _LABEL, "WriteLabels", "copy a dataset with its labels as columns, and push it on request"
     ),
+    "guard": Verb("train", _GUARD, "Guard", "make a guard of recorded episodes, without labels or training"),
     "cache": Verb("train", _TRAIN, "Cache", "decode a dataset's frames once, so that training does not have to"),
     "train-margin": Verb("train", _TRAIN, "TrainMargin", "fit the failure margin to labels on a frozen world model"),
     "train-reachability": Verb(

@@ -21,6 +21,8 @@ from lerobot_latentsafe.experiments.dubins.report import car_parts
 from lerobot_latentsafe.modeling_latentsafe import load_filter
 from lerobot_latentsafe.reports.figures import save, write_videos
 from lerobot_latentsafe.reports.filter_report import write_filter_report
+from lerobot_latentsafe.runtime.files import replacing
+from lerobot_latentsafe.runtime.options import require_at_least
 from lerobot_latentsafe.training import load_with_cache
 
 CAR = "latentsafe_dubins"
@@ -63,8 +65,8 @@ class EvalMonitor:
         for name, entry in row.items():
             print(f"{name:20s} {entry:.4f}" if isinstance(entry, float) else f"{name:20s} {entry}")
         if self.values_out:
-            self.values_out.parent.mkdir(parents=True, exist_ok=True)
-            np.save(self.values_out, value)
+            with replacing(self.values_out) as partial, partial.open("wb") as file:
+                np.save(file, value)
         if self.json:
             write_json(self.json, row)
         if self.figure:
@@ -100,9 +102,12 @@ class EvalShield:
     figure: Path | None = None
     """Where to draw the paths of the car, .png."""
 
+    def __post_init__(self) -> None:
+        _require_episodes(self.n_episodes, self.seed)
+        require_at_least("--n_videos", self.n_videos, 1)
+
     def run(self) -> None:
         """Compare, print and write."""
-        _require_episodes(self.n_episodes)
         if self.figure and self.env.type != CAR:
             raise ValueError(f"--figure draws paths of {CAR}, --env.type is {self.env.type!r}; give --video instead")
         policy = load_filter(self.policy.path, law=self.law, base_policy=self.base_policy_path)
@@ -125,9 +130,9 @@ class EvalShield:
             print(*write_videos(episodes, self.video, self.env.fps), sep="\n")
 
 
-def _require_episodes(n: int) -> None:
-    if n < 1:
-        raise ValueError(f"--n_episodes is {n}; expected at least 1")
+def _require_episodes(n: int, seed: int) -> None:
+    require_at_least("--n_episodes", n, 1)
+    require_at_least("--seed", seed, 0)
 
 
 def _compared(row: dict) -> Iterator[str]:
@@ -164,10 +169,12 @@ class EvalWorldModel:
     json: Path | None = None
     """Where to write the numbers."""
 
+    def __post_init__(self) -> None:
+        _require_episodes(self.n_episodes, self.seed)
+        require_at_least("--horizon", self.horizon, 1)
+
     def run(self) -> None:
         """Ask, print and write."""
-        if self.horizon < 1:
-            raise ValueError(f"--horizon is {self.horizon}; expected at least 1 step")
         policy, reader = load_with_cache(self.policy.path, self.dataset.metadata(), self.seed)
         episodes = self.dataset.of(reader.labels.episode, self.n_episodes)
         row = evaluate_world_model(policy.model, reader, episodes, self.seed, horizon=self.horizon)
@@ -215,9 +222,11 @@ class Report:
     seed: int = 0
     """Of the first start; the next ones follow."""
 
+    def __post_init__(self) -> None:
+        _require_episodes(self.n_episodes, self.seed)
+
     def run(self) -> None:
         """Write it."""
-        _require_episodes(self.n_episodes)
         if self.base_policy_path and self.env is None:
             raise ValueError("--base_policy_path runs a policy, but where? Give --env.type")
         policy = load_filter(self.policy.path, law=self.law, base_policy=self.base_policy_path)
@@ -249,6 +258,10 @@ class DrawFeatures:
     """Of the scene."""
     output: Path = Path("outputs/features.png")
     """The picture to write."""
+
+    def __post_init__(self) -> None:
+        for name, least in (("image_size", 1), ("step", 0), ("seed", 0)):
+            require_at_least(f"--{name}", getattr(self, name), least)
 
     def run(self) -> None:
         """Draw and save."""

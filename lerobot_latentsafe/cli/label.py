@@ -13,8 +13,8 @@ from lerobot_latentsafe.datasets.labels import UNLABELLED
 from lerobot_latentsafe.evaluation.along_episodes import episode_margins
 from lerobot_latentsafe.labeling import automatic
 from lerobot_latentsafe.labeling.carrying import carry_labels, specifications_in
-from lerobot_latentsafe.labeling.disagreements import find_disagreements, in_words, write_disagreements
-from lerobot_latentsafe.labeling.store import LabelStore
+from lerobot_latentsafe.labeling.disagreements import find_disagreements, write_disagreements
+from lerobot_latentsafe.labeling.store import LabelStore, in_words
 from lerobot_latentsafe.labeling.suggestions import Suggester
 from lerobot_latentsafe.modeling_latentsafe import load_filter
 
@@ -124,13 +124,17 @@ class CheckLabels:
         """Write the page, and print the worst."""
         model, frames = load_filter(self.policy.path).model, self.dataset.frames()
         store = LabelStore(frames.root, frames.meta.repo_id, [self.specification])
-        margins = dict(episode_margins(model, frames))
+        margins, without = {}, {}
+        for episode, margin in episode_margins(model, frames):
+            (without if isinstance(margin, str) else margins)[episode] = margin
         found = find_disagreements(store, self.specification, margins)
         for d in found[:20]:
             label = in_words(store.verdict(self.specification, d.episode).first, len(d.margin))
             print(f"episode {d.episode:5d}  {d.degree:.2f}  labelled: {label}")
         write_disagreements(self.output, found, store, frames, self.specification)
-        print(f"{len(found)} disagreements; open {self.output}")
+        for episode, why in [*without.items()][:SHOWN]:
+            print(f"episode {episode} was not judged, because {why}")
+        print(f"{len(found)} disagreements; {len(without)} episodes were not judged; open {self.output}")
 
 
 @dataclass

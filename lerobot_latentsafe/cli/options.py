@@ -15,6 +15,7 @@ from lerobot_latentsafe.datasets.episodes import DatasetFrames
 from lerobot_latentsafe.datasets.folder import load_metadata, open_dataset
 from lerobot_latentsafe.datasets.layout import INFO
 from lerobot_latentsafe.datasets.reading import DatasetContractError
+from lerobot_latentsafe.runtime.options import require_at_least
 
 
 @dataclass
@@ -145,7 +146,10 @@ class NewDataset:
     root: Path | None = None
     """The folder to write; by default LeRobot's own for this id."""
     num_episodes: int | None = None
-    """How many to record; by default 2,000 of the car, and as many of the Franka as the source says."""
+    """How many to record; by default 2,000 of the car, and as many of the Franka and the SO-101 as the source says."""
+
+    def __post_init__(self) -> None:
+        require_at_least("--dataset.num_episodes", self.num_episodes, 1)
 
     @property
     def folder(self) -> Path:

@@ -7,14 +7,13 @@ from pathlib import Path
 from lerobot.robots.config import RobotConfig
 from lerobot.scripts.lerobot_record import RecordConfig, record
 from lerobot.scripts.lerobot_teleoperate import TeleoperateConfig, teleoperate
-from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME
+from lerobot.utils.constants import HF_LEROBOT_HOME
 
 from lerobot_latentsafe.cli.options import DatasetSource, NewDataset
 from lerobot_latentsafe.collection import dubins, franka, so101
 from lerobot_latentsafe.collection.sent_actions import storing_what_was_sent
 from lerobot_latentsafe.datasets.columns import write_decisions
-from lerobot_latentsafe.datasets.decisions import FILE, check_recording
-from lerobot_latentsafe.datasets.labels import read_frames
+from lerobot_latentsafe.datasets.decisions import FILE
 from lerobot_latentsafe.robots.shielded.config_shielded import LatentSafeShieldedConfig
 from lerobot_latentsafe.robots.shielded.shielded import connected_shield
 
@@ -91,6 +90,9 @@ class Record(RecordConfig):
     What was proposed, V, l, and why the filter intervened is written to shield/decisions.parquet in the dataset's
     folder, frame by frame; `latentsafe merge-decisions` makes columns of it. It has all options of lerobot-record, and
     --filter.
+
+    Each episode is on disk, and can be read, before the next one begins. A recording that was killed goes on with
+    --resume=true; the episode that was being recorded then is left out.
     """
 
     filter: str | None = None
@@ -102,14 +104,17 @@ class Record(RecordConfig):
         if dataset.root is None and not self.resume:
             dataset.stamp_repo_id()
             dataset.no_stamp = True
-        journal = Path(dataset.root or HF_LEROBOT_HOME / dataset.repo_id) / FILE
+        if dataset.video_encoding_batch_size > 1:
+            raise ValueError(
+                f"--dataset.video_encoding_batch_size is {dataset.video_encoding_batch_size}; expected 1, for an "
+                "episode is saved with its videos. --dataset.streaming_encoding=true encodes them while the robot moves"
+            )
+        root = Path(dataset.root or HF_LEROBOT_HOME / dataset.repo_id)
         config = _lerobots(self, RecordConfig)
-        config.robot = _shielded(self.robot, self.filter, fps=dataset.fps, journal=journal)
-        with storing_what_was_sent(lambda: connected_shield().take_sent()):
-            dataset = record(config)
-        if journal.exists() and dataset.num_episodes:
-            check_recording(journal, read_frames(dataset.root, ["frame_index", ACTION]))
-        print(f"the actions are what was executed; what was proposed is in {journal}")
+        config.robot = _shielded(self.robot, self.filter, fps=dataset.fps)
+        with storing_what_was_sent(root, self.resume, lambda: connected_shield().take_sent()):
+            record(config)
+        print(f"the actions are what was executed; what was proposed is in {root / FILE}")
 
 
 @dataclass
@@ -158,6 +163,8 @@ class MergeDecisions:
 
     latentsafe merge-decisions --dataset.repo_id=me/shielded --dataset.root=data/shielded \\
       --new_repo_id=me/decisions --output_dir=data/decisions
+
+    With --dataset.episodes=[0,1] the copy holds these episodes alone, renumbered.
     """
 
     output_dir: Path
@@ -168,8 +175,6 @@ class MergeDecisions:
 
     def run(self) -> None:
         """Write the copy."""
-        self.dataset.require_whole(
-            "merge-decisions", "leave it out, and delete episodes of the copy with LeRobot's lerobot-edit-dataset"
-        )
-        written = write_decisions(self.dataset.opened(), self.output_dir, self.new_repo_id)
+        episodes = self.dataset.episodes
+        written = write_decisions(self.dataset.opened(), self.output_dir, self.new_repo_id, episodes)
         print(f"{written.num_frames} frames with the shield's decisions in {self.output_dir}")

@@ -4,13 +4,14 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 
-from lerobot_latentsafe.calibration import calibrate, episode_values, store
+from lerobot_latentsafe.calibration import calibrate, check_options, episode_values, store
 from lerobot_latentsafe.cli.options import CACHE_THEM, DatasetSource, PolicySource
-from lerobot_latentsafe.datasets.build_cache import Pictures, Tokens, build_frame_cache
+from lerobot_latentsafe.datasets.build_cache import TOKEN_TYPES, Pictures, Tokens, build_frame_cache
 from lerobot_latentsafe.encoders.perception import PerceptionConfig
 from lerobot_latentsafe.runtime import distributed
-from lerobot_latentsafe.runtime.files import refuse_existing
+from lerobot_latentsafe.runtime.files import replacing_folder
 from lerobot_latentsafe.runtime.hub import save_policy
+from lerobot_latentsafe.runtime.options import require_at_least
 from lerobot_latentsafe.training import load_with_cache, train_margin, train_reachability
 
 
@@ -37,11 +38,17 @@ class Cache:
     basis_from: Path | None = None
     """Another cache, whose principal components to use: one world model must read all its data by the same."""
 
+    def __post_init__(self) -> None:
+        require_at_least("--image_size", self.image_size, 1)
+        if self.dtype not in TOKEN_TYPES:
+            raise ValueError(f"--dtype is {self.dtype!r}; expected {' or '.join(TOKEN_TYPES)}")
+
     def run(self) -> None:
         """Build the cache, or go on building it."""
-        size, recipe = self.image_size or 32, Pictures
+        size, recipe = 96 if self.encoder else 32, Pictures
+        size = size if self.image_size is None else self.image_size
         if self.encoder:
-            size, config = self.image_size or 96, PerceptionConfig(encoder=self.encoder)
+            config = PerceptionConfig(encoder=self.encoder)
             recipe = partial(Tokens, config=config, dtype=self.dtype, basis_from=self.basis_from)
         cache = build_frame_cache(self.dataset.opened(), self.output_dir, size, recipe, self.dataset.episodes)
         if cache is None:
@@ -58,7 +65,7 @@ class TrainMargin:
       --dataset.repo_id=me/bag_cache --dataset.root=data/bag_tokens --output_dir=outputs/margin
 
     Do it after training a world model with --policy.margin.weight=0, and whenever labels change or another failure is
-    meant: the world model stays. Run train-reachability afterwards.
+    meant: the world model stays. Run train-reachability afterwards. If it was killed, start it again.
     """
 
     policy: PolicySource
@@ -67,6 +74,9 @@ class TrainMargin:
     dataset: DatasetSource = field(default_factory=DatasetSource)
     seed: int = 0
     """Of the margin's first weights, and of the windows that it is fitted to."""
+
+    def __post_init__(self) -> None:
+        require_at_least("--seed", self.seed, 0)
 
     def run(self) -> None:
         """Fit and save."""
@@ -97,6 +107,11 @@ class TrainReachability:
     """Gradient steps; by default the configuration's."""
     target: str = "reachability"
     """What the critic learns: the safety value (reachability), or SQRL's risk of failing, a baseline."""
+
+    def __post_init__(self) -> None:
+        require_at_least("--steps", self.steps, 1)
+        if not self.seeds or len({*self.seeds}) < len(self.seeds) or min(self.seeds) < 0:
+            raise ValueError(f"--seeds is {self.seeds}; expected numbers from 0 on, each once, such as [0,1,2]")
 
     def run(self) -> None:
         """Train and save, seed by seed."""
@@ -131,14 +146,18 @@ class Calibrate:
     lead_steps: int = 3
     """Frames of warning asked for before the failure."""
 
+    def __post_init__(self) -> None:
+        require_at_least("--n_episodes", self.n_episodes, 1)
+        check_options(self.max_missed, self.lead_steps)
+
     def run(self) -> None:
         """Choose, save, and print what it was chosen on."""
-        refuse_existing(self.output_dir)
-        policy, reader = load_with_cache(self.policy.path, self.dataset.metadata())
-        episodes = self.dataset.of(reader.labels.episode, self.n_episodes)
-        found = calibrate(episode_values(policy.model, reader, episodes), self.max_missed, self.lead_steps)
-        store(policy.config, found)
-        policy.config.change(frame_cache=None)
-        save_policy(policy, self.output_dir)
+        with replacing_folder(self.output_dir) as folder:
+            policy, reader = load_with_cache(self.policy.path, self.dataset.metadata())
+            episodes = self.dataset.of(reader.labels.episode, self.n_episodes)
+            found = calibrate(episode_values(policy.model, reader, episodes), self.max_missed, self.lead_steps)
+            store(policy.config, found)
+            policy.config.change(frame_cache=None)
+            save_policy(policy, folder)
         for name, value in asdict(found).items():
             print(f"{name:18s} {value:g}")

@@ -2,17 +2,18 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from tqdm import tqdm
 
+from lerobot_latentsafe.collection.parts import record_in_parts
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE
 from lerobot_latentsafe.dubins import car
 from lerobot_latentsafe.dubins.ground_truth import sample_task_start
-from lerobot_latentsafe.runtime.files import refuse_existing
 
+EPISODES_A_PART = 100
 FEATURES = {
     "observation.image": {"dtype": "image", "shape": (128, 128, 3), "names": ["height", "width", "channels"]},
     "observation.state": {"dtype": "float32", "shape": (2,), "names": car.STATE_NAMES},
@@ -138,32 +139,42 @@ WITH_POSITION = ("careful", "reckless")
 
 
 def collect_dubins(source: str, repo_id: str, root: str | Path, n_episodes: int | None, seed: int) -> LeRobotDataset:
-    """Record episodes of the car as a LeRobotDataset; None records the paper's 2,000.
+    """Record episodes of the car, or go on recording them; None records the paper's 2,000.
 
     Demonstrations also store the car's position as observation.environment_state, which lets a diffusion policy
     of a few hundred kB do the task; the safety filter reads images and heading only.
 
     Raises:
-        ValueError: unknown source.
+        ValueError: unknown source, no episodes, or an unfinished recording of another source or seed.
         FileExistsError: root exists.
+        FolderInUseError: another process records it.
     """
     if source not in SOURCES:
         raise ValueError(f"--source is {source!r}; expected one of {', '.join(SOURCES)}")
-    refuse_existing(root, "--dataset.root")
-    n_episodes = n_episodes or 2000
+    n = 2000 if n_episodes is None else n_episodes
+    # One stream of random numbers runs through all episodes.
+    episodes = cache(lambda: list(SOURCES[source](n, np.random.default_rng(seed))))
+    options = {"source": source, "repo_id": repo_id, "seed": seed}
+
+    def record(numbers: range, folder: Path) -> None:
+        _write(episodes()[numbers.start : numbers.stop], source, repo_id, folder)
+
+    return record_in_parts(repo_id, root, options, n, record, EPISODES_A_PART)
+
+
+def _write(episodes: list[Episode], source: str, repo_id: str, root: Path) -> None:
+    """Write the dataset of some episodes."""
     features = {**FEATURES, **(POSITION if source in WITH_POSITION else {})}
     dataset = LeRobotDataset.create(
         repo_id, car.FPS, features, root=root, robot_type="latentsafe_dubins", use_videos=False,
-        metadata_buffer_size=100,
+        metadata_buffer_size=EPISODES_A_PART,
     )  # fmt: skip
     renderer = car.Renderer()
-    episodes = SOURCES[source](n_episodes, np.random.default_rng(seed))
-    for episode in tqdm(episodes, total=n_episodes, desc=f"collecting {source}", unit="episode"):
+    for episode in episodes:
         for frame in episode_frames(episode, renderer, features):
             dataset.add_frame(frame)
         dataset.save_episode()
     dataset.finalize()
-    return dataset
 
 
 def episode_frames(episode: Episode, renderer: car.Renderer, features: dict) -> Iterator[dict]:

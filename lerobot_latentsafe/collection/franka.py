@@ -1,25 +1,20 @@
 """Recording the simulated Franka in bulk, through the same robot and operators as lerobot-record.
 
-Episodes are recorded in parts of a few dozen, each a finished dataset of its own in `<root>.parts`, by one process or
-several, and put together at the end: a run that was killed goes on with the parts that are missing, and never leaves a
-broken dataset. Episode i depends on the seed and i only.
+Episode i depends on the seed and i only.
 """
 
-import shutil
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 from lerobot.configs.video import RGBEncoderConfig
-from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from tqdm import tqdm
 
 from lerobot_latentsafe.collection.interventions import BRIEF, RETREATING, Interventions, InterventionStyle
+from lerobot_latentsafe.collection.parts import record_in_parts
 from lerobot_latentsafe.collection.policy_operator import PolicyOperator
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE
 from lerobot_latentsafe.evaluation.rollouts import Choice, steps
@@ -29,7 +24,6 @@ from lerobot_latentsafe.franka.behaviors import GRASPED, grasp, stray
 from lerobot_latentsafe.franka.scenes import CLUMSINESS, HELD_ANYWHERE, SCENES
 from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
 from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
-from lerobot_latentsafe.runtime.files import refuse_existing
 from lerobot_latentsafe.teleoperators.scripted.config_scripted import LatentSafeScriptedConfig
 from lerobot_latentsafe.teleoperators.scripted.scripted import LatentSafeScripted
 
@@ -138,51 +132,23 @@ def collect_franka(
         workers: processes that record.
 
     Raises:
-        ValueError: unknown source, no workers, or an unfinished recording of another source, seed or repo_id.
+        ValueError: unknown source, no workers or episodes, or an unfinished recording of another source or seed.
         FileExistsError: root exists.
+        FolderInUseError: another process records it.
     """
     if name not in SOURCES:
         raise ValueError(f"--source is {name!r}; expected one of {', '.join(SOURCES)}")
-    if workers < 1:
-        raise ValueError(f"--workers is {workers}; expected at least 1")
-    source, root = SOURCES[name], Path(root)
-    n_episodes = n_episodes or source.n_episodes
-    refuse_existing(root, "--dataset.root")
-    parts = root.with_name(root.name + ".parts")
-    _claim(parts, f"{name} {repo_id} seed {seed}")
-    size = min(EPISODES_A_PART, -(-n_episodes // workers))
-    episodes = [range(start, min(start + size, n_episodes)) for start in range(0, n_episodes, size)]
-    record = partial(_record_part, source, repo_id, parts, seed=seed)
-    with ExitStack() as stack:
-        # Spawned: a process that was forked cannot draw.
-        apply = stack.enter_context(get_context("spawn").Pool(workers)).imap if workers > 1 else map
-        folders = list(tqdm(apply(record, episodes), desc=f"collecting {name}", total=len(episodes), unit="part"))
-    together = parts / "together"
-    shutil.rmtree(together, ignore_errors=True)
-    aggregate_datasets([repo_id] * len(folders), repo_id, roots=folders, aggr_root=together)
-    together.rename(root)
-    shutil.rmtree(parts)
-    return LeRobotDataset(repo_id, root=root)
+    source = SOURCES[name]
+    n = source.n_episodes if n_episodes is None else n_episodes
+    record = partial(_record, source, repo_id, seed)
+    options = {"source": name, "repo_id": repo_id, "seed": seed}
+    return record_in_parts(repo_id, root, options, n, record, EPISODES_A_PART, workers)
 
 
-def _claim(parts: Path, what: str) -> None:
-    """Note what the parts are of, and refuse to mix."""
-    note = parts / "of.txt"
-    if note.exists() and note.read_text() != what:
-        raise ValueError(f"{parts} holds an unfinished recording of {note.read_text()!r}, not {what!r}; delete it")
-    parts.mkdir(parents=True, exist_ok=True)
-    note.write_text(what)
-
-
-def _record_part(source: Source, repo_id: str, parts: Path, episodes: range, seed: int) -> Path:
-    """The finished dataset of some episodes, recorded unless it is there."""
-    part = parts / f"{episodes.start:06d}_{episodes.stop:06d}"
-    if part.exists():
-        return part
-    unfinished = part.with_suffix(".unfinished")
-    shutil.rmtree(unfinished, ignore_errors=True)
+def _record(source: Source, repo_id: str, seed: int, episodes: range, root: Path) -> None:
+    """Write the dataset of some episodes."""
     dataset = LeRobotDataset.create(
-        repo_id, SCENES[source.scene].fps, features(source), root=unfinished, robot_type=LatentSafeFrankaMujoco.name,
+        repo_id, SCENES[source.scene].fps, features(source), root=root, robot_type=LatentSafeFrankaMujoco.name,
         streaming_encoding=True, encoder_threads=1, metadata_buffer_size=EPISODES_A_PART,
         rgb_encoder=RGBEncoderConfig(vcodec="h264", preset="veryfast", crf=20),
     )  # fmt: skip
@@ -193,7 +159,6 @@ def _record_part(source: Source, repo_id: str, parts: Path, episodes: range, see
                 dataset.add_frame(frame)
             dataset.save_episode()
     dataset.finalize()
-    return unfinished.rename(part)
 
 
 def episode_frames(robot: LatentSafeFrankaMujoco, source: Source, episode: int, seed: int) -> Iterator[dict]:

@@ -14,6 +14,7 @@ from lerobot_latentsafe.collection.interventions import Interventions, Intervent
 from lerobot_latentsafe.decision import LawOptions
 from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES, action_limits
 from lerobot_latentsafe.franka.scene import CAMERAS
+from lerobot_latentsafe.guard import standing_still
 from lerobot_latentsafe.modeling_latentsafe import load_filter
 
 OBSERVED = {
@@ -41,6 +42,7 @@ class PolicyOperator:
             self.policy = BasePolicy.load(path)
             return
         self.filter = load_filter(shield, law=LawOptions(mode="monitor"), base_policy=path)
+        self.filter.shield.clock = standing_still  # the simulation waits for its operator
         self.policy = self.filter.base
 
     def begin(self, seed: int) -> None:

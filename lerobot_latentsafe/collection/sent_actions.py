@@ -1,49 +1,126 @@
 """A recording's actions are what the robot was sent, whatever lies between the operator and the dataset.
 
 LeRobot stores what comes out of its `teleop_action_processor`, not what `send_action` returns. Plugins replace that
-processor, or change the action after it. So what is stored is taken from the robot, where LeRobot stores it.
+processor, or change the action after it. So what is stored is taken from the robot, where LeRobot stores it. The
+decision on each stored frame is kept beside it, and joins the dataset with its episode.
 """
 
+import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import ACTION
 
-from lerobot_latentsafe._compat import last_added
+from lerobot_latentsafe._compat import WRITER, episode_to_write
+from lerobot_latentsafe.collection.whole_episodes import WORK, WholeEpisodes, recover
+from lerobot_latentsafe.datasets.decisions import FILE, Journal, matching_rows
+from lerobot_latentsafe.datasets.labels import read_frames
+from lerobot_latentsafe.datasets.layout import INFO, check_layout
+from lerobot_latentsafe.decision import FilterDecision
+from lerobot_latentsafe.runtime.files import locked_folder
+
+logger = logging.getLogger(__name__)
+
+Sent = tuple[dict[str, float], FilterDecision | None]
+"""What was executed, by name, in robot units; and the decision that led to it, if it was judged."""
+
+KEPT = "Nothing of this episode was stored; those before it are whole"
 
 
-@contextmanager
-def storing_what_was_sent(take_sent: Callable[[], dict[str, float] | None]) -> Iterator[None]:
-    """Meanwhile each frame that is added to a dataset holds the action that was sent since the last one.
+class SentActions(WholeEpisodes):
+    """A writer that stores, with each frame, the action that was sent since the last one, and the decision on it."""
 
-    Args:
-        take_sent: gives that action by name, in robot units, and forgets it; None if nothing was sent.
+    def __init__(self, *args, take_sent: Callable[[], Sent | None], **options):
+        super().__init__(*args, **options)
+        self.take_sent, self.journal = take_sent, Journal(self.dataset / FILE)
 
-    Raises:
-        ValueError: before an episode is stored: nothing was sent, the dataset is to hold other commands, or something
-            else changes what it holds.
-    """
-    add = LeRobotDataset.add_frame
+    def add_frame(self, frame: dict) -> None:
+        """Store a frame.
 
-    def add_sent(dataset: LeRobotDataset, frame: dict) -> None:
-        names, sent = dataset.features[ACTION]["names"], take_sent()
-        if sent is None or set(names) != set(sent):
-            _refuse(", ".join(names), ", ".join(sent) if sent else "nothing")
-        action = np.array([sent[name] for name in names], np.float32)
-        add(dataset, {**frame, ACTION: action})
-        stored = last_added(dataset, ACTION)
-        if not np.array_equal(stored, action):
-            _refuse(str(stored), str(action))
+        Raises:
+            ValueError: nothing was sent, it was not judged, or the dataset is to hold other commands.
+        """
+        names, (sent, decision) = self._meta.features[ACTION]["names"], self.take_sent() or ({}, None)
+        if set(names) != set(sent):
+            _refuse(", ".join(names), ", ".join(sent) or "nothing")
+        if decision is None:
+            raise ValueError(
+                "the operator commands what the filter knows nothing of, and the robot held still; use a teleoperator "
+                f"that commands {', '.join(names)}. {KEPT}"
+            )
+        action, episode = np.array([sent[name] for name in names], np.float32), episode_to_write(self)
+        if episode["size"] == 0:
+            self.journal.begin(int(episode["episode_index"]))
+        super().add_frame({**frame, ACTION: action})
+        self.journal.add(decision, action.tolist())
 
-    with patch.object(LeRobotDataset, "add_frame", add_sent):
-        yield
+    def save_episode(self, *args, **options) -> None:
+        """Save the episode.
+
+        Raises:
+            ValueError: something else changed what it holds.
+        """
+        stored, sent = np.array(episode_to_write(self)[ACTION], np.float32), self.journal.executed()
+        if not np.array_equal(stored, sent):
+            changed = next((t for t, (a, b) in enumerate(zip(stored, sent)) if (a != b).any()), 0)
+            _refuse(*(str(actions[changed : changed + 1].tolist()) for actions in (stored, sent)))
+        super().save_episode(*args, **options)
+
+    def write_beside(self, folder: Path) -> None:
+        """The decisions join with their episode."""
+        self.journal.write_to(folder / FILE)
 
 
 def _refuse(stored: str, sent: str) -> None:
     raise ValueError(
         f"a frame was to store {stored}, and the robot was sent {sent}. A plugin changes what LeRobot stores: record "
-        "without it. Nothing of this episode was stored"
+        f"without it. {KEPT}"
     )
+
+
+@contextmanager
+def storing_what_was_sent(root: Path, resume: bool, take_sent: Callable[[], Sent | None]) -> Iterator[None]:
+    """Meanwhile LeRobot records whole episodes into `root`, with the actions that were sent and the decisions on them.
+
+    Args:
+        resume: whether a recording in `root` goes on; if it was killed, it is completed first.
+        take_sent: gives what was sent since it was asked last, and forgets it.
+
+    Raises:
+        FileExistsError: `root` exists, and no recording goes on.
+        ValueError: the recording in `root` cannot go on; nothing was changed.
+        FolderInUseError: another process records into it.
+    """
+    with locked_folder(root):
+        if resume:
+            _continue(root)
+        elif root.exists():
+            raise FileExistsError(
+                f"{root} exists already; --resume=true goes on with the recording in it, another --dataset.root begins "
+                "one"
+            )
+        with patch(WRITER, partial(SentActions, take_sent=take_sent)):
+            yield
+
+
+def _continue(root: Path) -> None:
+    """Complete a recording that was killed, and refuse one whose decisions are not those of its episodes."""
+    if not (root / INFO).exists():
+        raise ValueError(f"{root} holds no recording to go on with; leave --resume out to begin one")
+    if (root / WORK).exists():
+        logger.warning("the recording in %s was killed: what was saved is whole, a torn episode is left out", root)
+        recover(root)
+    if not any(root.glob("data/*/*.parquet")):
+        return
+    check_layout(root)
+    try:
+        matching_rows(root / FILE, read_frames(root, ["frame_index", ACTION]))
+    except (ValueError, FileNotFoundError) as e:
+        raise ValueError(
+            f"the recording in {root} cannot go on: {e}. Or record into another --dataset.root, and join both with "
+            "lerobot-edit-dataset --operation.type=merge. Nothing was changed"
+        ) from e

@@ -2,19 +2,21 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from tqdm import tqdm
 
+from lerobot_latentsafe.collection.parts import record_in_parts
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE
 from lerobot_latentsafe.robots.so101_mujoco.config_so101_mujoco import LatentSafeSO101MujocoConfig
 from lerobot_latentsafe.robots.so101_mujoco.so101_mujoco import LatentSafeSO101Mujoco
-from lerobot_latentsafe.runtime.files import refuse_existing
 from lerobot_latentsafe.so101.actions import CAMERAS, EPISODE_SECONDS, FPS, IMAGE_SIZE, NAMES
 from lerobot_latentsafe.teleoperators.so101_leader.config_so101_leader import LatentSafeSO101LeaderConfig
 from lerobot_latentsafe.teleoperators.so101_leader.so101_leader import LatentSafeSO101Leader
+
+EPISODES_A_PART = 50
 
 
 @dataclass(frozen=True)
@@ -57,28 +59,33 @@ def part_of(name: str, episode: int) -> Part:
 
 
 def collect_so101(name: str, repo_id: str, root: str | Path, n_episodes: int | None, seed: int) -> LeRobotDataset:
-    """Record a source; None records it whole. Episode i depends on the seed and i only.
+    """Record a source, or go on recording it; None records it whole. Episode i depends on the seed and i only.
 
     Raises:
-        ValueError: unknown source.
+        ValueError: unknown source, no episodes, or an unfinished recording of another source or seed.
         FileExistsError: root exists.
+        FolderInUseError: another process records it.
     """
     if name not in SOURCES:
         raise ValueError(f"--source is {name!r}; expected one of {', '.join(SOURCES)}")
-    refuse_existing(root, "--dataset.root")
-    n_episodes = n_episodes or sum(part.episodes for part in SOURCES[name])
+    n = sum(part.episodes for part in SOURCES[name]) if n_episodes is None else n_episodes
+    options = {"source": name, "repo_id": repo_id, "seed": seed}
+    return record_in_parts(repo_id, root, options, n, partial(_record, name, repo_id, seed), EPISODES_A_PART)
+
+
+def _record(name: str, repo_id: str, seed: int, episodes: range, root: Path) -> None:
+    """Write the dataset of some episodes."""
     dataset = LeRobotDataset.create(
         repo_id, FPS, FEATURES, root=root, robot_type=LatentSafeSO101Mujoco.name, use_videos=False,
-        metadata_buffer_size=100,
+        metadata_buffer_size=EPISODES_A_PART,
     )  # fmt: skip
     with LatentSafeSO101Mujoco(LatentSafeSO101MujocoConfig()) as robot:
-        for episode in tqdm(range(n_episodes), desc=f"collecting {name}", unit="episode"):
+        for episode in episodes:
             robot.reset(1_000_000 * seed + episode)
             for frame in episode_frames(robot, part_of(name, episode), episode):
                 dataset.add_frame(frame)
             dataset.save_episode()
     dataset.finalize()
-    return dataset
 
 
 def episode_frames(robot: LatentSafeSO101Mujoco, part: Part, seed: int) -> Iterator[dict]:

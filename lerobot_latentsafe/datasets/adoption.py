@@ -5,10 +5,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import torch
 
-from lerobot_latentsafe.datasets.contract import Contract
+from lerobot_latentsafe.datasets.contract import ACTION, STATE, Contract, DatasetContractError
+from lerobot_latentsafe.looks import Response, by_tick
 from lerobot_latentsafe.meanings import Command, contradictions, settle, tell_meanings
-from lerobot_latentsafe.units import TrainedOn
+from lerobot_latentsafe.units import AT_REST, TrainedOn
 
 logger = logging.getLogger(__name__)
 
@@ -18,6 +20,10 @@ RANGE_SLACK = 0.25
 """Share of the range trained on by which another dataset's actions may exceed it."""
 SCALE_PERCENTILE = 99
 """Of the size of displacements: what is 1 inside. A single jerk of the operator must not make all else inaudible."""
+SMALL = 0.05
+"""Share of a command's range by which it may always change from tick to tick: that is no jump."""
+RARE, ABSURD = 1e-3, 10.0
+"""Of the rarest such share of frames, what lies beyond all others by over so many times their range is a glitch."""
 
 
 def adopt_dataset(known: TrainedOn, contract: Contract) -> TrainedOn:
@@ -72,16 +78,74 @@ def _first_dataset(trained_on: TrainedOn, contract: Contract) -> TrainedOn:
     for command in commands:
         logger.info("%s is a %s", command.name, command.described)
     logger.info("if that is wrong, say what they are with --policy.trained_on.meanings")
+    refuse_glitches(contract)
     state = contract.state
-    return replace(
+    adopted = replace(
         _with_ranges(trained_on, contract, commands),
         meanings={c.name: c.described for c in commands},
-        state_low=state.min(0).tolist(),
-        state_high=state.max(0).tolist(),
-        state_step=_largest_step(contract).tolist(),
         state_mean=state.mean(0, dtype=np.float64).tolist(),
         state_std=state.std(0, dtype=np.float64).clip(min=1e-3).tolist(),
     )
+    return with_limits(adopted, contract)
+
+
+def with_limits(known: TrainedOn, contract: Contract) -> TrainedOn:
+    """With how far, how fast and how suddenly states and commands go, where that is not known yet."""
+    adds_up = np.array([c.meaning in ("delta", "velocity") for c in known.commands])
+    state, rest = contract.state, _largest_step(contract)
+    small = SMALL * (np.array(known.action_high) - np.array(known.action_low))
+    limits: dict[str, np.ndarray] = {
+        "state_low": state.min(0),
+        "state_high": state.max(0),
+        "state_step": rest,
+        "action_step": np.maximum(_largest_change(contract, 1), small),
+        "action_jerk": np.maximum(_largest_change(contract, 2), small),
+    }
+    if contract.state_names:
+        limits["unanswered"] = _unanswered(contract, AT_REST * rest, adds_up)
+    return replace(known, **{name: v.tolist() for name, v in limits.items() if getattr(known, name) is None})
+
+
+def refuse_glitches(contract: Contract) -> None:
+    """Refuse single numbers that are absurd beside all others: whatever lies between would count as in range.
+
+    Raises:
+        DatasetContractError: naming the number, its frame and the remedy.
+    """
+    features = {ACTION: (contract.action, contract.action_names), STATE: (contract.state, contract.state_names)}
+    for key, (values, names) in features.items():
+        rare = max(1, int(RARE * len(values)))
+        ordered = np.sort(values.astype(np.float64), 0)
+        low, high = ordered[rare : len(values) - rare][[0, -1]] if len(values) > 2 * rare else ordered[[0, -1]]
+        far = np.maximum(values - high, low - values) > ABSURD * np.where(high > low, high - low, np.inf)
+        for row, column in np.argwhere(far)[:1]:
+            episode = contract.episode[row]
+            frame = row - np.argmax(contract.episode == episode)
+            raise DatasetContractError(
+                f"{names[column]} of {key} is {values[row, column]:g} in frame {frame} of episode {episode} of "
+                f"{contract.repo_id}, and from {low[column]:g} to {high[column]:g} in nearly all others: what lies "
+                "between would count as in range. If it is a glitch, correct it, or leave it out: lerobot-edit-dataset "
+                f"--operation.type=delete_episodes --operation.episode_indices='[{episode}]'"
+            )
+
+
+def _largest_change(contract: Contract, order: int) -> np.ndarray:
+    """The largest difference, of first or second order, of each command from tick to tick: (A,)."""
+    changes = np.abs(np.diff(contract.action, order, axis=0))[contract.episode[order:] == contract.episode[:-order]]
+    return changes.max(0, initial=0.0)
+
+
+def _unanswered(contract: Contract, rest: np.ndarray, adds_up: np.ndarray) -> np.ndarray:
+    """How far each command goes at most while the state stays as it is: (A,); see `looks.Response`."""
+    state, action = torch.from_numpy(contract.state), torch.from_numpy(contract.action)
+    response = Response(torch.from_numpy(np.float32(rest)), torch.from_numpy(adds_up))
+    sent, most = torch.full_like(action[:1], torch.nan), torch.zeros(action.shape[1])
+    for frames in by_tick(torch.from_numpy(contract.episode)):
+        there = (frames >= 0)[:, None]
+        went = response.unanswered(torch.where(there, state[frames], torch.nan), sent.expand(len(frames), -1))
+        most = torch.maximum(most, torch.where(there, went, 0.0).amax(0))
+        sent = action[frames]
+    return most.numpy()
 
 
 def _largest_step(contract: Contract) -> np.ndarray:

@@ -10,9 +10,9 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Protocol
 
 import numpy as np
@@ -42,10 +42,20 @@ from lerobot_latentsafe.datasets.label_places import sidecar_path, specification
 from lerobot_latentsafe.datasets.labels import Content, Sidecar, all_labels
 from lerobot_latentsafe.encoders.perception import Perception, PerceptionConfig
 from lerobot_latentsafe.encoders.pictures import to_model_images
-from lerobot_latentsafe.runtime.files import refuse_existing, replacing
+from lerobot_latentsafe.runtime.files import (
+    allocate,
+    keep_room,
+    locked_folder,
+    refuse_existing,
+    replacing,
+    replacing_folder,
+    scratch_folder,
+)
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
+from lerobot_latentsafe.runtime.options import require_at_least
 
 LAYOUT, DONE = "layout.json", "done.npy"
+TOKEN_TYPES = ("float16", "int8")
 ENCODED_AT_ONCE = 8
 """Frames an encoder reads together: few enough for its activations to stay in a CPU's cache."""
 TOGETHER = 2**21
@@ -124,8 +134,8 @@ class Tokens:
         self, cameras: list[str], image_size: int, config: PerceptionConfig, dtype: str = "float16",
         basis_from: str | Path | None = None,
     ):  # fmt: skip
-        if dtype not in ("float16", "int8"):
-            raise ValueError(f"--dtype is {dtype!r}; expected float16 or int8")
+        if dtype not in TOKEN_TYPES:
+            raise ValueError(f"--dtype is {dtype!r}; expected {' or '.join(TOKEN_TYPES)}")
         self.perception, self.dtype, self.basis_from = Perception(config, cameras, image_size), dtype, basis_from
         n_patches = self.perception.n_patches
         self.arrays = {
@@ -210,15 +220,41 @@ def build_frame_cache(
 
     Raises:
         FileExistsError: output_dir holds something else, a finished cache, or an unfinished one of something else.
+        FolderInUseError: another build writes it.
+        OSError: the disk has no room for all of it.
+        ValueError: there are no pictures of such a size.
         DatasetContractError: a dataset that cannot be used as it is.
         LabelFileError: its labels are none.
         FrameCacheError: it has no camera.
     """
-    output_dir, folder = Path(output_dir), Path(output_dir) / FOLDER
-    rank = int(os.environ.get("RANK", 0))
-    unfinished = (folder / LAYOUT).exists() and not (folder / MANIFEST).exists()
-    if rank == 0 and not unfinished:
-        refuse_existing(output_dir)
+    require_at_least("--image_size", image_size, 1)
+    output_dir = Path(output_dir)
+    with locked_folder(output_dir) if _rank() == 0 else nullcontext():
+        folder = output_dir / FOLDER
+        unfinished = (folder / LAYOUT).exists() and not (folder / MANIFEST).exists()
+        if _rank() == 0 and not unfinished:
+            refuse_existing(output_dir)
+        contract = _contract_with_cameras(dataset)
+        frames = DatasetFrames(dataset.meta, episodes)
+        frames.cameras = list(contract.cameras)
+        see = Sight(frames, image_size)
+        kept = recipe(frames.cameras, image_size)
+        keep_freed_memory()
+        if _rank() == 0 and not unfinished:
+            _lay_out(dataset, contract, frames.episodes, output_dir, kept, see)
+        _await_layout(_layout(dataset, frames.episodes, kept), folder)
+        kept.start(folder)
+        copy = LeRobotDatasetMetadata(f"{dataset.repo_id}_cache", root=output_dir)
+        return _finish(contract, copy, kept) if _fill(copy, kept, see) else None
+
+
+def _rank() -> int:
+    """Which of several processes this is."""
+    return int(os.environ.get("RANK", 0))
+
+
+def _contract_with_cameras(dataset: LeRobotDataset) -> Contract:
+    """What a dataset says, if it has pictures, and labels that training would not refuse."""
     contract = Contract.read(dataset.meta)
     if not contract.cameras:
         known = "".join(f"{key} is left out: {why}; " for key, why in contract.left_out.items())
@@ -226,24 +262,16 @@ def build_frame_cache(
             f"{dataset.repo_id} has no camera to cache: {known}its features are {', '.join(dataset.meta.features)}. "
             "Record one with a camera"
         )
-    all_labels(dataset.root, dataset.meta.features, dataset.repo_id)  # refuses what training would refuse
-    frames = DatasetFrames(dataset.meta, episodes)
-    frames.cameras = list(contract.cameras)
-    see = Sight(frames, image_size)
-    kept = recipe(frames.cameras, image_size)
-    keep_freed_memory()
-    if rank == 0 and not unfinished:
-        _lay_out(dataset, contract, frames.episodes, output_dir, kept, see)
-    _await_layout(_layout(dataset, frames.episodes, kept), folder)
-    kept.start(folder)
-    copy = LeRobotDatasetMetadata(f"{dataset.repo_id}_cache", root=output_dir)
-    return _finish(contract, copy, kept) if _fill(copy, kept, see) else None
+    all_labels(dataset.root, dataset.meta.features, dataset.repo_id)
+    return contract
 
 
 def _fill(copy: LeRobotDatasetMetadata, kept: Recipe, see: Sight) -> bool:
     """Perceive this process's share of the episodes; whether all processes have done theirs."""
-    rank, world = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
+    rank, world = _rank(), int(os.environ.get("WORLD_SIZE", 1))
     folder = Path(copy.root) / FOLDER
+    for name in kept.arrays:
+        keep_room(folder / f"{name}.npy")  # an array that was copied may have holes
     done = np.load(folder / DONE, mmap_mode="r+")
     mine = [e for e in range(rank, copy.total_episodes, world) if not done[e]]
     for episode in tqdm(mine, desc="decoding episodes", unit="episode", disable=rank > 0):
@@ -277,33 +305,31 @@ def _lay_out(
     dataset: LeRobotDataset, contract: Contract, episodes: list[int], output_dir: Path, kept: Recipe, see: Sight
 ) -> None:
     """Copy the dataset without images and make room for all frames; output_dir appears when that is done."""
-    begun = output_dir.with_name(f"{output_dir.name}.begun")
-    shutil.rmtree(begun, ignore_errors=True)
-    copy = _without_cameras(dataset, episodes, begun)
-    _copy_labels(dataset, episodes, begun)
-    if not copy.meta.stats:  # lerobot-train wants some
-        write_stats(Contract.read(copy.meta).statistics, begun)
-    folder, n = begun / FOLDER, copy.num_frames
-    folder.mkdir()
-    rows = np.isin(contract.episode, episodes)
-    np.save(folder / "state.npy", contract.state[rows])
-    np.save(folder / "action.npy", contract.action[rows])
-    for name, (shape, dtype) in kept.arrays.items():
-        np.lib.format.open_memmap(folder / f"{name}.npy", mode="w+", dtype=dtype, shape=(n, *shape))
-    np.save(folder / DONE, np.zeros(copy.num_episodes, bool))
-    kept.prepare(folder, see, copy.num_episodes)
-    _write(folder / LAYOUT, _layout(dataset, episodes, kept))
-    begun.rename(output_dir)
+    with replacing_folder(output_dir) as begun:
+        copy = _without_cameras(dataset, episodes, begun, output_dir)
+        _copy_labels(dataset, episodes, begun)
+        if not copy.meta.stats:  # lerobot-train wants some
+            write_stats(Contract.read(copy.meta).statistics, begun)
+        folder, n = begun / FOLDER, copy.num_frames
+        folder.mkdir()
+        rows = np.isin(contract.episode, episodes)
+        np.save(folder / "state.npy", contract.state[rows])
+        np.save(folder / "action.npy", contract.action[rows])
+        for name, (shape, dtype) in kept.arrays.items():
+            allocate(folder / f"{name}.npy", dtype, (n, *shape))
+        np.save(folder / DONE, np.zeros(copy.num_episodes, bool))
+        kept.prepare(folder, see, copy.num_episodes)
+        _write(folder / LAYOUT, _layout(dataset, episodes, kept))
 
 
-def _without_cameras(dataset: LeRobotDataset, episodes: list[int], folder: Path) -> LeRobotDataset:
-    """A copy of these episodes without pictures."""
+def _without_cameras(dataset: LeRobotDataset, episodes: list[int], folder: Path, output_dir: Path) -> LeRobotDataset:
+    """A copy of these episodes without pictures, for output_dir."""
     cameras, repo_id = list(dataset.meta.camera_keys), f"{dataset.repo_id}_cache"
     others = sorted({*range(dataset.num_episodes)} - {*episodes})
     if not others:
         return remove_feature(dataset, cameras, output_dir=folder, repo_id=repo_id)
-    with TemporaryDirectory(dir=folder.parent) as temporary:
-        bare = remove_feature(dataset, cameras, output_dir=Path(temporary) / "bare", repo_id=repo_id)
+    with scratch_folder(output_dir) as scratch:
+        bare = remove_feature(dataset, cameras, output_dir=scratch / "bare", repo_id=repo_id)
         drop_episode_statistics(bare.root, cameras)
         return delete_episodes(bare, others, output_dir=folder, repo_id=repo_id)
 
@@ -330,8 +356,8 @@ def _await_layout(expected: list, folder: Path, patience_s: float = 600) -> None
         time.sleep(0.1)
     if json.loads((folder / LAYOUT).read_text()) != expected:
         raise FileExistsError(
-            f"{folder} holds an unfinished cache of another dataset, size or encoder; choose another --output_dir or "
-            "delete it"
+            f"{folder} holds an unfinished cache of another dataset, size or encoder; give the same to go on with it, "
+            "or choose another --output_dir"
         )
 
 

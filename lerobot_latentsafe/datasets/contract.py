@@ -6,7 +6,8 @@ A `Contract` is what remains when that is settled; a dataset that has none is re
 
 import functools
 import logging
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -44,6 +45,7 @@ class Contract:
         episode: int64 (N,), of the frames in the order of the index.
         state, action: float32 (N, S) and (N, A), all finite.
         seconds_apart: by how much times and frames differ at most, seconds.
+        broken: episode -> which of its numbers is not finite, of those that were left out; see `read_sound`.
     """
 
     repo_id: str
@@ -58,6 +60,7 @@ class Contract:
     state: np.ndarray = field(repr=False)
     action: np.ndarray = field(repr=False)
     seconds_apart: float = 0.0
+    broken: dict[int, str] = field(default_factory=dict)
 
     @classmethod
     def read(cls, meta: "LeRobotDatasetMetadata") -> "Contract":
@@ -68,6 +71,32 @@ class Contract:
         Raises:
             DatasetContractError: what file or feature is wrong, what was expected, and the remedy.
         """
+        contract = cls._read(meta)
+        contract._check_finite()
+        return contract
+
+    @classmethod
+    def read_sound(cls, meta: "LeRobotDatasetMetadata") -> "Contract":
+        """The same, without the frames of episodes that hold NaN or infinity: for those who look at each alone.
+
+        Raises:
+            DatasetContractError: as `read`, or no episode is sound.
+        """
+        contract = cls._read(meta)
+        broken: dict[int, str] = {}
+        for key, row, column in contract._not_finite():
+            for episode, at in zip(*np.unique(contract.episode[row], return_index=True)):
+                broken.setdefault(int(episode), contract._first(key, row[at:], column[at:]))
+        sound = ~np.isin(contract.episode, [*broken])
+        if not sound.any():
+            contract._check_finite()
+        return replace(
+            contract, broken=broken,
+            episode=contract.episode[sound], state=contract.state[sound], action=contract.action[sound],
+        )  # fmt: skip
+
+    @classmethod
+    def _read(cls, meta: "LeRobotDatasetMetadata") -> "Contract":
         check_features(meta)
         frames = read_frames(meta.root, [ACTION, STATE, "timestamp", "frame_index"])
         episode = frames["episode_index"].astype(np.int64)
@@ -82,13 +111,42 @@ class Contract:
         state_names, action_names = settled_names(
             _names(meta, STATE), _names(meta, ACTION), state.shape[1], action.shape[1]
         )
-        _check_finite(meta, episode, {STATE: (state, state_names), ACTION: (action, action_names)})
         for key, why in left_out.items():
             _say_once(f"{meta.repo_id}: {key} is left out: {why}")
         return cls(
             meta.repo_id, Path(meta.root), meta.info.robot_type, meta.fps, state_names, action_names, cameras, left_out,
             episode, state, action, apart,
         )  # fmt: skip
+
+    def _not_finite(self) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+        """Of each feature that holds NaN or infinity: rows and columns of these numbers."""
+        for key, values in ((STATE, self.state), (ACTION, self.action)):
+            row, column = np.nonzero(~np.isfinite(values))
+            if len(row):
+                yield key, row, column
+
+    def _first(self, key: str, row: np.ndarray, column: np.ndarray) -> str:
+        values, names = (self.state, self.state_names) if key == STATE else (self.action, self.action_names)
+        episode = self.episode[row[0]]
+        frame = row[0] - np.searchsorted(self.episode, episode)
+        return f"{names[column[0]]} is {values[row[0], column[0]]} in frame {frame} of episode {episode}"
+
+    def _check_finite(self) -> None:
+        """Refuse NaN and infinity, which would make every loss NaN."""
+        for key, row, column in self._not_finite():
+            affected = np.unique(self.episode[row]).tolist()
+            raise DatasetContractError(
+                f"{key} of {self.repo_id} is not finite in {len(np.unique(row))} of {len(self.episode)} frames, in "
+                f"episodes {some(affected)}: {self._first(key, row, column)}. Make a copy without those episodes: "
+                f"lerobot-edit-dataset --repo_id={self.repo_id} --root={self.root} --new_repo_id={self.repo_id}_whole "
+                f"--new_root={self.root}_whole --operation.type=delete_episodes "
+                f"--operation.episode_indices='{affected}'"
+            )
+
+    def only(self, episodes: list[int] | None) -> "Contract":
+        """The same of these episodes alone; None: all."""
+        kept = np.isin(self.episode, self.episode if episodes is None else episodes)
+        return replace(self, episode=self.episode[kept], state=self.state[kept], action=self.action[kept])
 
     @property
     def statistics(self) -> dict[str, dict[str, np.ndarray]]:
@@ -154,25 +212,6 @@ def _numbers(meta: "LeRobotDatasetMetadata", frames: dict[str, np.ndarray], key:
         )
     with np.errstate(over="ignore"):  # what is too large for 32 bits is refused as infinite
         return values.astype(np.float32)
-
-
-def _check_finite(
-    meta: "LeRobotDatasetMetadata", episode: np.ndarray, features: dict[str, tuple[np.ndarray, list[str]]]
-) -> None:
-    """Refuse NaN and infinity, which would make every loss NaN."""
-    begins = np.searchsorted(episode, episode)
-    for key, (values, names) in features.items():
-        row, column = np.nonzero(~np.isfinite(values))
-        if len(row):
-            affected = np.unique(episode[row]).tolist()
-            first = f"{names[column[0]]} is {values[row[0], column[0]]} in frame {row[0] - begins[row[0]]}"
-            raise DatasetContractError(
-                f"{key} of {meta.repo_id} is not finite in {len(np.unique(row))} of {len(values)} frames, in episodes "
-                f"{some(affected)}: {first} of episode {episode[row[0]]}. Make a copy without those episodes: "
-                f"lerobot-edit-dataset --repo_id={meta.repo_id} --root={meta.root} --new_repo_id={meta.repo_id}_whole "
-                f"--new_root={meta.root}_whole --operation.type=delete_episodes "
-                f"--operation.episode_indices='{affected}'"
-            )
 
 
 def _seconds_apart(meta: "LeRobotDatasetMetadata", frames: dict[str, np.ndarray], videos: list[str]) -> float:

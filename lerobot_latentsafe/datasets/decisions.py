@@ -7,6 +7,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from lerobot_latentsafe.datasets.reading import some
 from lerobot_latentsafe.decision import FilterDecision, Reason
 from lerobot_latentsafe.runtime.files import replacing
 
@@ -17,11 +18,14 @@ FILE = Path("shield") / "decisions.parquet"
 
 
 class Journal:
-    """Rows of decisions by episode and frame, written to a parquet file after every episode.
+    """Rows of decisions by episode and frame, for a parquet file.
 
     Columns: episode_index, frame_index, proposed and executed (lists of float, robot units), value, margin, intervened,
     reason (the name of a `Reason`). What was executed tells which dataset it belongs to. Frames count from 0 in each
     episode; the pauses between episodes leave no rows.
+
+    Raises:
+        ValueError: the file exists and is not readable.
     """
 
     def __init__(self, path: Path):
@@ -33,12 +37,11 @@ class Journal:
                 self.episodes.setdefault(row["episode_index"], []).append(row)
             self.episode = max(self.episodes, default=-1) + 1
 
-    def hear(self, announced: int | str) -> None:
-        """Begin an episode, anew if it was begun before, or end one."""
-        self.write()
-        self.episode = announced if isinstance(announced, int) else None
-        if self.episode is not None:
-            self.episodes[self.episode] = []
+    def begin(self, episode: int | None) -> None:
+        """Begin an episode, anew if it was begun before; None: a pause."""
+        self.episode = episode
+        if episode is not None:
+            self.episodes[episode] = []
 
     def add(self, decision: FilterDecision, executed: list[float]) -> None:
         """Note the decision on the next frame (batch of one), and what the robot made of it."""
@@ -58,15 +61,28 @@ class Journal:
             }
         )
 
+    def executed(self) -> np.ndarray:
+        """What was executed in the present episode, (T, A)."""
+        return np.array([row["executed"] for row in self.episodes.get(self.episode, [])], np.float32)
+
+    def write_to(self, path: Path) -> None:
+        """Write all rows into a file.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        path.parent.mkdir(parents=True, exist_ok=True)
+        rows = [row for _, episode in sorted(self.episodes.items()) for row in episode]
+        pq.write_table(pa.Table.from_pylist(rows), path)
+
     def write(self) -> None:
         """Replace the file at once by what is known; a failure to write is logged, for the robot must go on."""
-        rows = [row for _, episode in sorted(self.episodes.items()) for row in episode]
-        if not rows:
+        if not any(self.episodes.values()):
             return
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with replacing(self.path) as partial:
-                pq.write_table(pa.Table.from_pylist(rows), partial)
+                self.write_to(partial)
         except OSError as e:
             logger.error("decisions were not written to %s (%s); they are kept and tried again", self.path, e)
 
@@ -75,12 +91,18 @@ def _read(path: Path) -> pa.Table:
     """The table of a journal.
 
     Raises:
+        FileNotFoundError: there is none.
         ValueError: torn, or not a journal.
     """
+    if not Path(path).exists():
+        raise FileNotFoundError(f"{path} does not exist; `latentsafe record` writes it, put it back if it did")
     try:
-        return pq.read_table(path)
+        table = pq.read_table(path)
     except (pa.ArrowInvalid, OSError) as e:
-        raise ValueError(f"{path} is not a readable journal of decisions ({e}); move it away") from e
+        raise ValueError(f"{path} is not a readable file of decisions ({e}); put a copy of it there") from e
+    if missing := {"episode_index", "frame_index", "executed"} - {*table.column_names}:
+        raise ValueError(f"{path} holds no decisions: it lacks {', '.join(sorted(missing))}; put a copy of it there")
+    return table
 
 
 def decision_columns(path: Path, frames: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -93,15 +115,10 @@ def decision_columns(path: Path, frames: dict[str, np.ndarray]) -> dict[str, np.
         proposed (N, A) and value, margin (N,) float32; intervened, reason (N,) int64.
 
     Raises:
-        ValueError: the journal lacks a frame, or holds other actions: it belongs to another dataset.
+        ValueError: the journal lacks an episode, or holds other actions: it belongs to another dataset.
         FileNotFoundError: there is no journal.
     """
-    if not Path(path).exists():
-        raise FileNotFoundError(f"{path} does not exist; record with `latentsafe record` to get one")
-    rows = {(row["episode_index"], row["frame_index"]): row for row in _read(path).to_pylist()}
-    wanted = list(zip(frames["episode_index"].tolist(), frames["frame_index"].tolist()))
-    _check_dataset(path, rows, wanted, frames["action"])
-    found = [rows[key] for key in wanted]
+    found = matching_rows(path, frames)
     return {
         "proposed": np.array([row["proposed"] for row in found], np.float32),
         "value": np.array([row["value"] for row in found], np.float32),
@@ -111,41 +128,31 @@ def decision_columns(path: Path, frames: dict[str, np.ndarray]) -> dict[str, np.
     }
 
 
-def check_recording(path: Path, frames: dict[str, np.ndarray]) -> None:
-    """Refuse a recording whose stored actions are not those that its journal says the robot executed.
+def matching_rows(path: Path, frames: dict[str, np.ndarray]) -> list[dict]:
+    """A journal's row for each frame of a dataset, in their order.
 
     Args:
-        frames: episode_index, frame_index (N,) and action (N, A) of the dataset. Episodes without decisions, recorded
-            in another way, are left alone.
+        frames: episode_index, frame_index (N,) and action (N, A) of the dataset.
 
     Raises:
-        ValueError: naming the first frame that differs, with what to do.
+        ValueError: naming the episodes without decisions, or the first frame that stores another action.
+        FileNotFoundError: there is no journal.
     """
-    executed = {(row["episode_index"], row["frame_index"]): row["executed"] for row in _read(path).to_pylist()}
-    decided = {episode for episode, _ in executed}
-    for episode, frame, stored in zip(
-        frames["episode_index"].tolist(), frames["frame_index"].tolist(), frames["action"]
-    ):
-        sent = executed.get((episode, frame))
-        if episode in decided and (sent is None or not np.allclose(sent, stored, rtol=1e-5, atol=1e-6)):
-            raise ValueError(
-                f"episode {episode}, frame {frame} stores {stored.tolist()}, and the robot executed {sent}: something "
-                "changes what LeRobot stores. Record again without that plugin; what was executed is in "
-                f"{path}"
-            )
-
-
-def _check_dataset(path: Path, rows: dict[tuple, dict], wanted: list[tuple], action: np.ndarray) -> None:
-    missing = [key for key in wanted if key not in rows]
-    if missing:
+    rows = {(row["episode_index"], row["frame_index"]): row for row in _read(path).to_pylist()}
+    decided, stored = {episode for episode, _ in rows}, {*frames["episode_index"].tolist()}
+    if lacking := sorted(stored - decided):
+        having = sorted(stored & decided)
         raise ValueError(
-            f"{path} holds no decision for episode {missing[0][0]}, frame {missing[0][1]} and {len(missing) - 1} more "
-            "frames; it belongs to another dataset"
+            f"{path} holds no decisions of episodes {some(lacking)}: they were recorded without `latentsafe record`, "
+            f"or the file is not all. Put all of it there, or leave them out: --dataset.episodes={having}"
         )
-    for key, stored in zip(wanted, action):
-        executed = rows[key].get("executed")
-        if executed is None or not np.allclose(executed, stored, rtol=1e-5, atol=1e-6):
+    found = []
+    for episode, frame, action in zip(*(frames[key].tolist() for key in ("episode_index", "frame_index", "action"))):
+        row = rows.get((episode, frame), {"executed": None})
+        if row["executed"] is None or not np.allclose(row["executed"], action, rtol=1e-5, atol=1e-6):
             raise ValueError(
-                f"{path} says that {executed} was executed in episode {key[0]}, frame {key[1]}, the dataset "
-                f"{stored.tolist()}; it belongs to another dataset. Put the journal of this recording there"
+                f"{path} says that {row['executed']} was executed in episode {episode}, frame {frame}, the dataset "
+                f"{action}; it belongs to another dataset. Put the decisions of this one there"
             )
+        found.append(row)
+    return found

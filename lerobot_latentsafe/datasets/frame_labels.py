@@ -7,8 +7,9 @@ from typing import Self
 import numpy as np
 
 from lerobot_latentsafe.datasets.fingerprints import by_length_alone
+from lerobot_latentsafe.datasets.label_places import LabelFileError
 
-FAILING, SAFE, UNLABELLED = 1, 0, -1
+FAILING, SAFE, UNLABELLED = LABELS = 1, 0, -1
 
 
 @dataclass
@@ -85,3 +86,21 @@ class FrameLabels:
             np.where(taken, other.failure, self.failure), np.where(taken, places[other.by], self.by).astype(np.int32),
             np.where(taken, other.at, self.at), names, self.left,
         )  # fmt: skip
+
+
+def as_labels(values: np.ndarray, n: int, source: str) -> np.ndarray:
+    """Exactly -1, 0 or 1 for each of n frames: what is cast to int8 unchecked could turn into "safe".
+
+    Raises:
+        LabelFileError: anything else, naming some of it.
+    """
+    if values.shape == (n, 1):
+        values = values[:, 0]
+    if values.shape != (n,):
+        raise LabelFileError(f"{source} holds {values.size} labels for {n} frames; expected one a frame")
+    told = np.unique(values) if values.dtype.kind in "biuf" else values
+    told = told if values.dtype.kind in "biufO" else told.astype(str)  # NumPy's times would become whole numbers
+    unknown = sorted({str(v) for v in told.tolist() if not (isinstance(v, int | float) and v in LABELS)})
+    if unknown:
+        raise LabelFileError(f"{source} holds {', '.join(unknown[:5])}; expected 1, 0 or -1")
+    return values.astype(np.int8)

@@ -1,7 +1,6 @@
 """Failure labels: one verdict a frame, kept outside `observation.*` so that no policy can read the answer."""
 
 import hashlib
-import json
 import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -12,8 +11,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from lerobot_latentsafe.datasets.arrow import to_numpy
 from lerobot_latentsafe.datasets.fingerprints import by_length_alone, episode_spans, fingerprint, telling_columns
-from lerobot_latentsafe.datasets.frame_labels import FAILING, SAFE, UNLABELLED, FrameLabels
+from lerobot_latentsafe.datasets.frame_labels import FAILING, SAFE, UNLABELLED, FrameLabels, as_labels
+from lerobot_latentsafe.datasets.label_file import METADATA, SCHEMA, LabelTable, Written, read_label_file
 from lerobot_latentsafe.datasets.label_places import (
     FOLDER,
     NAME,
@@ -28,8 +29,6 @@ from lerobot_latentsafe.datasets.reading import DOWNLOAD_AGAIN, BrokenFileError,
 from lerobot_latentsafe.runtime.files import replacing
 
 logger = logging.getLogger(__name__)
-
-SCHEMA, METADATA = 2, b"latentsafe_labels"
 
 
 def read_frames(root: str | Path, columns: Iterable[str] = ()) -> dict[str, np.ndarray]:
@@ -55,7 +54,7 @@ def read_frames(root: str | Path, columns: Iterable[str] = ()) -> dict[str, np.n
 def _read_columns(file: Path, names: list[str]) -> dict[str, np.ndarray]:
     with reading(file):
         table = pq.ParquetFile(file).read(columns=names)
-        return {name: _to_numpy(table[name]) for name in names}
+        return {name: to_numpy(table[name]) for name in names}
 
 
 def _joined(parts: list[np.ndarray]) -> np.ndarray:
@@ -63,31 +62,6 @@ def _joined(parts: list[np.ndarray]) -> np.ndarray:
     if len({part.shape[1:] for part in parts}) > 1:
         parts = [np.fromiter(part, object, len(part)) for part in parts]
     return np.concatenate(parts)
-
-
-def _to_numpy(column: pa.Array | pa.ChunkedArray) -> np.ndarray:
-    """(N,) or (N, D): lists of one length become rows, anything ragged or with holes an array of objects."""
-    if isinstance(column, pa.ChunkedArray):
-        column = pa.concat_arrays(column.chunks) if column.num_chunks else pa.array([], column.type)
-    values, n = _plain(column), len(column)
-    while _is_list(values.type):
-        lengths = set(values.value_lengths().to_pylist()) if not pa.types.is_fixed_size_list(values.type) else {0}
-        if len(lengths) > 1 or values.null_count:
-            return column.to_numpy(zero_copy_only=False)
-        values = _plain(values.flatten())
-    numbers = values.to_numpy(zero_copy_only=False)
-    return numbers.reshape(n, -1) if _is_list(_plain(column).type) and n else numbers
-
-
-def _plain(column: pa.Array) -> pa.Array:
-    """Without what LeRobot's and Arrow's types wrap around the values."""
-    if isinstance(column.type, pa.ExtensionType):
-        column = column.storage
-    return column.dictionary_decode() if pa.types.is_dictionary(column.type) else column
-
-
-def _is_list(kind: pa.DataType) -> bool:
-    return pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
 
 
 class Content:
@@ -182,66 +156,47 @@ class Sidecar(FrameLabels):
         Raises:
             LabelFileError: of another dataset, of another schema, not readable, or values that are no labels.
         """
-        try:
-            table = pq.read_table(path)
-        except (pa.ArrowInvalid, OSError) as e:
-            raise LabelFileError(f"{path} is not a readable parquet file ({e}); restore it or move it away") from e
-        missing = {"index", "failure"} - set(table.column_names)
-        if missing:
-            raise LabelFileError(f"{path} lacks the columns {sorted(missing)}; expected index and failure")
-        written = json.loads((table.schema.metadata or {}).get(METADATA, b"null"))
+        written, table = read_label_file(path)
         if not by_place and _knows_little(written, content):
             raise LabelFileError(f"{path} does not tell of which episodes it is; move it to its dataset")
         if written is None:
             return cls._of_table(table, len(content), len(content), path)
-        if written.get("schema") not in (1, SCHEMA):
-            raise LabelFileError(
-                f"{path} has schema {written.get('schema')}, this version reads 1 and {SCHEMA}; "
-                "use the version that wrote it, or move the file away. Nothing was overwritten"
-            )
-        covered = written["frames"]
-        if written["schema"] == SCHEMA:
-            stored = cls._of_table(table, covered, covered, path)
-            found = stored.moved(content, written["columns"], written["episodes"], written["lengths"])
+        if written.schema == SCHEMA:
+            stored = cls._of_table(table, written.frames, written.frames, path)
+            found = stored.moved(content, written.columns, written.episodes, written.lengths)
         else:
             found = cls._of_schema_1(table, written, content, repo_id, path)
         if found is None:
             raise LabelFileError(
-                f"{path} was made for another dataset ({written['repo_id']}, {covered} frames, {written['identity']}); "
-                f"this one has {len(content)} frames ({content.identity}). Move the file to its dataset. Nothing was "
-                "overwritten"
+                f"{path} was made for another dataset ({written.repo_id}, {written.frames} frames, "
+                f"{written.identity}); this one has {len(content)} frames ({content.identity}). Move the file to its "
+                "dataset. Nothing was overwritten"
             )
         return found
 
     @classmethod
-    def _of_table(cls, table: pa.Table, covered: int, n: int, path: Path) -> "Sidecar":
+    def _of_table(cls, table: LabelTable, covered: int, n: int, path: Path) -> "Sidecar":
         """Labels of n frames, from a table of the first `covered`."""
-        index = _to_numpy(table["index"].combine_chunks())
+        index = table.index
         if len(index) != covered or not np.array_equal(np.sort(index), np.arange(covered)):
             raise LabelFileError(
                 f"{path} labels {len(index)} frames, the dataset has {n}; expected each index 0..{covered - 1} once. "
                 "It may belong to another dataset"
             )
         sidecar = cls.empty(n)
-        failure = _to_numpy(table["failure"].combine_chunks())
-        sidecar.failure[index] = as_labels(failure, covered, str(path))
-        if "labelled_by" in table.column_names:
-            column = table["labelled_by"].combine_chunks()
-            column = column if pa.types.is_dictionary(column.type) else column.dictionary_encode()
-            sidecar.by[index], sidecar.names = column.indices.fill_null(-1).to_numpy(), column.dictionary.to_pylist()
-        if "labelled_at" in table.column_names:
-            sidecar.at[index] = table["labelled_at"].cast(pa.int64()).fill_null(0).to_numpy()
+        sidecar.failure[index], sidecar.by[index], sidecar.at[index] = table.failure, table.by, table.at
+        sidecar.names = table.names
         return sidecar
 
     @classmethod
     def _of_schema_1(
-        cls, table: pa.Table, written: dict, content: Content, repo_id: str | None, path: Path
+        cls, table: LabelTable, written: Written, content: Content, repo_id: str | None, path: Path
     ) -> "Sidecar | None":
         """From a file that knows its dataset by actions, or, where there are none, by its name."""
-        covered = written["frames"]
-        if covered > len(content) or content.identity_by_actions(covered) != written["identity"]:
+        covered = written.frames
+        if covered > len(content) or content.identity_by_actions(covered) != written.identity:
             return None
-        if "action" not in content.frames and repo_id not in (None, written["repo_id"], f"{written['repo_id']}_cache"):
+        if "action" not in content.frames and repo_id not in (None, written.repo_id, f"{written.repo_id}_cache"):
             return None
         return cls._of_table(table, covered, len(content), path)
 
@@ -257,9 +212,10 @@ class Sidecar(FrameLabels):
             content: of the dataset whose frames these are.
         """
         n = len(self.failure)
-        described = {"schema": SCHEMA, "frames": n, "identity": content.identity, "repo_id": repo_id}
-        described |= {"columns": content.columns, "lengths": content.spans[1].tolist()}
-        described |= {"episodes": content.fingerprints(content.columns)}
+        described = Written(
+            SCHEMA, n, content.identity, repo_id, content.columns, content.spans[1].tolist(),
+            content.fingerprints(content.columns),
+        )  # fmt: skip
         by = pa.DictionaryArray.from_arrays(pa.array(self.by, mask=self.by < 0), pa.array(self.names, pa.string()))
         table = pa.table(
             {
@@ -268,7 +224,7 @@ class Sidecar(FrameLabels):
                 "labelled_by": by,
                 "labelled_at": pa.array(self.at, pa.timestamp("us", "UTC"), mask=self.at == 0),
             }
-        ).replace_schema_metadata({METADATA: json.dumps(described)})
+        ).replace_schema_metadata({METADATA: described.as_json()})
         with replacing(path) as partial:
             pq.write_table(
                 table,
@@ -279,11 +235,11 @@ class Sidecar(FrameLabels):
             )
 
 
-def _knows_little(written: dict | None, content: Content) -> bool:
+def _knows_little(written: Written | None, content: Content) -> bool:
     """Whether nothing in a label file but lengths tells of which episodes it is."""
-    if written is None or "columns" not in written:
+    if written is None or written.schema != SCHEMA:
         return written is None or "action" not in content.frames
-    return by_length_alone(written["columns"])
+    return by_length_alone(written.columns)
 
 
 def labelled_nearby(specification: str, content: Content) -> list[Path]:
@@ -401,15 +357,3 @@ def all_labels(root: str | Path, features: dict[str, dict], repo_id: str | None 
         if (sidecar := Sidecar.find(root, name, content, repo_id)) is not None:
             found[name] = sidecar.failure
     return found
-
-
-def as_labels(values: np.ndarray, n: int, source: str) -> np.ndarray:
-    """Exactly -1, 0 or 1 for each of n frames: what is cast to int8 unchecked could turn into "safe"."""
-    if values.shape == (n, 1):
-        values = values[:, 0]
-    if values.shape != (n,):
-        raise LabelFileError(f"{source} holds {values.size} labels for {n} frames; expected one a frame")
-    unknown = sorted({str(v) for v in set(values.tolist()) if v not in (FAILING, SAFE, UNLABELLED)})
-    if unknown:
-        raise LabelFileError(f"{source} holds {', '.join(unknown[:5])}; expected 1, 0 or -1")
-    return values.astype(np.int8)

@@ -9,7 +9,7 @@ from typing import Any
 import pyarrow.parquet as pq
 
 from lerobot_latentsafe.datasets.reading import DatasetContractError, reading
-from lerobot_latentsafe.runtime.files import refuse_existing
+from lerobot_latentsafe.runtime.files import refuse_existing, replacing_folder
 
 ACTION, STATE, OBSERVATION = "action", "observation.state", "observation."
 HUGGINGFACE = b"huggingface"
@@ -66,13 +66,11 @@ def renamed_copy(root: Path, renames: dict[str, str], output_dir: Path) -> None:
     names = [renames.get(key, key) for key in features]
     if taken := sorted({name for name in names if names.count(name) > 1}):
         raise DatasetContractError(f"--rename_map gives the name {', '.join(taken)} twice; each feature needs its own")
-    begun = output_dir.with_name(f"{output_dir.name}.begun")
-    shutil.rmtree(begun, ignore_errors=True)
-    for file in sorted(path for path in root.rglob("*") if path.is_file()):
-        copy = begun / _renamed_path(file.relative_to(root), renames)
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        _copy_file(file, copy, file.relative_to(root), renames)
-    begun.rename(output_dir)
+    with replacing_folder(output_dir) as begun:
+        for file in sorted(path for path in root.rglob("*") if path.is_file()):
+            copy = begun / _renamed_path(file.relative_to(root), renames)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            _copy_file(file, copy, file.relative_to(root), renames)
 
 
 def _renamed_path(path: Path, renames: dict[str, str]) -> Path:

@@ -27,8 +27,11 @@ class EpisodeValues:
     margin: np.ndarray
 
 
-def check_fit(model: SafetyModel, frames: DatasetFrames) -> None:
+def check_fit(model: SafetyModel, frames: DatasetFrames, contract: Contract | None = None) -> None:
     """Refuse a dataset of another robot, rate or camera than the filter's, and a filter without a world model.
+
+    Args:
+        contract: of the dataset, if it has been read.
 
     Raises:
         ValueError: naming what differs.
@@ -36,7 +39,7 @@ def check_fit(model: SafetyModel, frames: DatasetFrames) -> None:
     """
     model.require_stage("world_model")
     trained_on = model.config.trained_on
-    adopt_dataset(trained_on, Contract.read(frames.meta))
+    adopt_dataset(trained_on, contract or Contract.read(frames.meta))
     missing = [camera for camera in trained_on.cameras if camera not in frames.cameras]
     if missing:
         raise ValueError(
@@ -60,17 +63,42 @@ def values_along(model: SafetyModel, frames: DatasetFrames, episode: int) -> Epi
 
 def episode_margins(
     model: SafetyModel, frames: DatasetFrames, batch_size: int = 16
-) -> Iterator[tuple[int, np.ndarray]]:
+) -> Iterator[tuple[int, np.ndarray | str]]:
     """Margins (T,) along every episode that is meant, filtered from its first frame: (episode, margin) in order.
+
+    Of an episode that cannot be judged, because its numbers or margins are not finite or its pictures cannot be read,
+    (episode, why). The others are judged all the same.
 
     Raises:
         ValueError: the dataset is of another robot, rate or camera than the filter's.
     """
-    check_fit(model, frames)
+    contract = Contract.read_sound(frames.meta)
+    check_fit(model, frames, contract)
     for batch in _batches(frames, batch_size):
+        found = {episode: contract.broken[episode] for episode in batch if episode in contract.broken}
+        found |= _judged(model, frames, [episode for episode in batch if episode not in found])
+        yield from ((episode, found[episode]) for episode in batch)
+
+
+def _judged(model: SafetyModel, frames: DatasetFrames, batch: list[int]) -> dict[int, np.ndarray | str]:
+    """Episode -> margin (T,), or why there is none; of a batch that fails, each episode alone."""
+    if not batch:
+        return {}
+    try:
         latents, length = encode_episodes(model, frames, batch)
         margin = model.imagination.margin(latents).detach().cpu().numpy()
-        yield from zip(batch, (row[:n] for row, n in zip(margin, length)))
+    except Exception as e:
+        if len(batch) == 1:
+            return {batch[0]: " ".join(f"{type(e).__name__}: {e}".split())}
+        return {episode: why for alone in batch for episode, why in _judged(model, frames, [alone]).items()}
+    rows = {episode: row[:n] for episode, row, n in zip(batch, margin, length)}
+    return {episode: row if np.isfinite(row).all() else _not_finite(row) for episode, row in rows.items()}
+
+
+def _not_finite(margin: np.ndarray) -> str:
+    return (
+        f"the filter's margin is {margin[~np.isfinite(margin)][0]} in frame {np.flatnonzero(~np.isfinite(margin))[0]}"
+    )
 
 
 def _batches(frames: DatasetFrames, batch_size: int) -> Iterator[list[int]]:

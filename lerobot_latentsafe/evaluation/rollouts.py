@@ -20,6 +20,7 @@ from lerobot_latentsafe.base_policy import BasePolicy
 from lerobot_latentsafe.decision import FilterDecision, Reason
 from lerobot_latentsafe.evaluation.nearest_frames import NearestFrames
 from lerobot_latentsafe.evaluation.statistics import paired_p_value, wilson
+from lerobot_latentsafe.guard import standing_still
 from lerobot_latentsafe.latent import Latent, select
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 
@@ -92,6 +93,8 @@ class PolicyActor:
     """A bare policy, or a filter with or without a base policy, from the beginning of episodes on."""
 
     def __init__(self, policy: BasePolicy | LatentSafePolicy):
+        if isinstance(policy, LatentSafePolicy):
+            policy.shield.clock = standing_still  # worlds wait for what is done in them
         policy.reset()
         self.policy = policy
 

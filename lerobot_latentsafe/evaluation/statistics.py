@@ -17,6 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
+from lerobot_latentsafe.runtime.files import locked_folder, replacing
+
 _STARTED = time.process_time()
 
 
@@ -92,12 +94,11 @@ def _commit() -> str:
 
 def write_json(path: str | Path, content: dict) -> None:
     """Write results, lists of numbers on one line and what is not a number as null, making folders as needed."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     content = json.loads(json.dumps(content), parse_constant=lambda name: None if name == "NaN" else float(name))
     text = json.dumps(content, indent=2)
     text = re.sub(r'\[\n([^\[\]{}":]*)\]', lambda numbers: f"[{' '.join(numbers[1].split())}]", text)
-    path.write_text(text + "\n")
+    with replacing(path) as partial:
+        partial.write_text(text + "\n")
 
 
 def run_resumable(path: Path, jobs: list[dict], run: Callable[[dict], dict], workers: int = 1) -> list[dict]:
@@ -112,15 +113,16 @@ def run_resumable(path: Path, jobs: list[dict], run: Callable[[dict], dict], wor
     Returns:
         What `run` returned, and cpu_s, its CPU seconds.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    rows = dict(_kept_rows(path))
-    missing = [job for job in jobs if _key(job) not in rows]
     with ExitStack() as stack:
+        stack.enter_context(locked_folder(path))
+        rows = dict(_kept_rows(path))
+        missing = [job for job in jobs if _key(job) not in rows]
         stream = stack.enter_context(path.open("a"))
         apply = stack.enter_context(get_context("spawn").Pool(workers)).imap_unordered if workers > 1 else map
         for done, (job, row) in enumerate(apply(partial(_ran, run), missing), 1):
             stream.write(json.dumps({"job": job, "row": row}) + "\n")
             stream.flush()
+            os.fsync(stream.fileno())
             rows[_key(job)] = row
             print(f"\r{done} of {len(missing)} episodes", end="\n" if done == len(missing) else "", flush=True)
     return [rows[_key(job)] for job in jobs]

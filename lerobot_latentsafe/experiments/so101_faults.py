@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_latentsafe.evaluation.faults import BROKEN, FAULTS
+from lerobot_latentsafe.evaluation.faults import BROKEN, FAULTS, FAULTS_OF_DEGREES
 from lerobot_latentsafe.experiments.scene_world import SceneWorld
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
 from lerobot_latentsafe.so101.operators import begin
@@ -15,6 +15,7 @@ from lerobot_latentsafe.so101.scene import PushScene
 
 SETTLED, MOVING, BROKEN_FOR = 10, 45, 8
 """Steps at rest, or of an operator's push, before something breaks; and steps for which it is broken."""
+INCOMING = {**FAULTS, **FAULTS_OF_DEGREES}
 NOTHING_IS_SAFE = 2.0
 """A threshold that V never exceeds."""
 
@@ -33,7 +34,7 @@ def fault_motions(path: str, seeds: range) -> dict[str, dict[str, float]]:
     """
     policy, scene, table = load_filter(path), PushScene(), {}
     own = policy.config.law.epsilon
-    for fault in [*FAULTS, *BROKEN]:
+    for fault in [*INCOMING, *BROKEN]:
         rest = [_moved_at_rest(policy, scene, seed, fault) for seed in seeds]
         steps = {}
         for name, policy.config.law.epsilon in (("step", own), ("step_nothing_safe", NOTHING_IS_SAFE)):
@@ -81,7 +82,7 @@ def _drive(
         for _ in range(BROKEN_FOR):
             given = {"observation": world.observe(), "proposed": _row(wanted())}
             joints = scene.proprioception()
-            action = policy.shield(**FAULTS.get(fault, dict)(given)).action.numpy()
+            action = policy.shield(**INCOMING.get(fault, dict)(given)).action.numpy()
             note(action[0], joints)
             world.step(action)
 

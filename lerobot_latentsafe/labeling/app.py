@@ -220,6 +220,8 @@ class LabelServer:
         if known is not None:
             entry |= {"guess": known.guess, "usefulness": round(known.usefulness, 3)}
             entry |= {"contradiction": round(contradiction(known.margin, labels), 3)}
+        elif self.suggester and (why := self.suggester.why_silent(episode)):
+            entry["silent"] = why
         return entry
 
 

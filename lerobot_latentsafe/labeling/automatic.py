@@ -7,6 +7,7 @@ named on the command line as `dubins_truth` or `my_module:my_function`; `vision_
 import base64
 import importlib
 import json
+import logging
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -20,7 +21,9 @@ from tqdm import tqdm
 
 from lerobot_latentsafe.datasets.episodes import DatasetFrames
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE, UNLABELLED
-from lerobot_latentsafe.labeling.store import LabelStore
+from lerobot_latentsafe.labeling.store import LabelStore, first_failing, in_words
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -194,6 +197,54 @@ def find_labeller(name: str) -> Labeller:
         ) from e
 
 
+class UnsavedAnswersError(OSError):
+    """Answers that could not be saved, each named in the message.
+
+    Attributes:
+        answers: episode -> int8 labels (T,).
+    """
+
+    def __init__(self, answers: dict[int, np.ndarray], why: OSError):
+        said = "; ".join(f"episode {episode}: {_in_words(labels)}" for episode, labels in answers.items())
+        super().__init__(
+            f"{len(answers)} answers could not be saved ({why}): {said}. Make room, then give the same command again: "
+            "it asks about these episodes once more"
+        )
+        self.answers = answers
+
+
+def _in_words(labels: np.ndarray) -> str:
+    first = first_failing(labels)
+    return str(labels.tolist()) if first is None else in_words(first, len(labels))
+
+
+class _Answers:
+    """Saves each answer at once. What a full disk refuses is kept, and tried again with the next and in the end."""
+
+    def __init__(self, save: Callable[[dict[int, np.ndarray]], None]):
+        self.save, self.unsaved = save, dict[int, np.ndarray]()
+
+    def add(self, episode: int, labels: np.ndarray) -> None:
+        """Save an answer; raises UnsavedAnswersError once PATIENCE of them are unsaved."""
+        self.unsaved[episode] = labels
+        try:
+            self.settle()
+        except UnsavedAnswersError as e:
+            if len(self.unsaved) >= PATIENCE:
+                raise
+            logger.warning("kept, and tried again with the next answer: %s", e)
+
+    def settle(self) -> None:
+        """Save what is unsaved, or raise UnsavedAnswersError."""
+        if not self.unsaved:
+            return
+        try:
+            self.save(self.unsaved)
+        except OSError as e:
+            raise UnsavedAnswersError(dict(self.unsaved), e) from e
+        self.unsaved.clear()
+
+
 def label_automatically(
     store: LabelStore, frames: DatasetFrames, specification: str, labeller: Labeller, name: str
 ) -> dict[str, list]:
@@ -207,9 +258,24 @@ def label_automatically(
 
     Raises:
         LabellerError: so many episodes failed in a row that the next would, too.
-        OSError: an answer was not saved.
+        UnsavedAnswersError: answers could not be saved, nor later; it names them.
     """
     open_episodes = [e for e in frames.episodes if (store.labels(specification, e) == UNLABELLED).all()]
+    answers = _Answers(lambda said: store.label_frames(specification, said, f"auto {name}"))
+    try:
+        result = _ask(open_episodes, store, frames, labeller, name, answers)
+    except UnsavedAnswersError:
+        raise
+    except BaseException:  # also Ctrl-C
+        answers.settle()
+        raise
+    answers.settle()
+    return result
+
+
+def _ask(
+    open_episodes: list[int], store: LabelStore, frames: DatasetFrames, labeller: Labeller, name: str, answers: _Answers
+) -> dict[str, list]:
     result: dict[str, list] = {"labelled": [], "undecided": [], "refused": [], "failed": []}
     in_a_row = 0
     for number in tqdm(open_episodes, desc=name, unit="episode"):
@@ -230,11 +296,9 @@ def label_automatically(
                 ) from e
             continue
         else:
-            if vector is None:
-                result["undecided"].append(number)
-            else:
-                store.label_frames(specification, {number: vector}, f"auto {name}")
-                result["labelled"].append(number)
+            if vector is not None:
+                answers.add(number, vector)
+            result["undecided" if vector is None else "labelled"].append(number)
         in_a_row = 0
     return result
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from lerobot_latentsafe.datasets.episodes import DatasetFrames
 from lerobot_latentsafe.datasets.labels import FAILING, UNLABELLED
-from lerobot_latentsafe.labeling.store import LabelStore
+from lerobot_latentsafe.labeling.store import LabelStore, in_words
 from lerobot_latentsafe.labeling.suggestions import Suggestion, contradiction
 from lerobot_latentsafe.reports import html
 
@@ -35,13 +35,6 @@ def find_disagreements(
         if degree >= least and (failure != UNLABELLED).any():
             found.append(Disagreement(episode, degree, margin, failure))
     return sorted(found, key=lambda d: -d.degree)
-
-
-def in_words(first: int | None, length: int) -> str:
-    """A verdict on an episode of so many frames."""
-    if first is None:
-        return "mixed labels"
-    return "never fails" if first == length else f"fails from frame {first}"
 
 
 def write_disagreements(

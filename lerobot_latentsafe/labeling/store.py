@@ -22,6 +22,7 @@ from lerobot_latentsafe.datasets.labels import (
     SAFE,
     UNLABELLED,
     Content,
+    LabelFileError,
     Sidecar,
     as_labels,
     carry_hint,
@@ -74,6 +75,7 @@ class LabelStore:
         self.content = Content(root, self._paths)
         self.identity, (self.start, self.length) = self.content.identity, self.content.spans
         self._lock = threading.RLock()
+        self._known: dict[str, tuple[int, ...] | None] = {}  # what each file was when it was last read or written
         self._undo: dict[tuple[str, str], list] = defaultdict(list)
         self._guard = own_folder(label_folders(root, repo_id)[0], self.root)
         try:  # what another process saved until now is read, and nothing that it still would
@@ -92,15 +94,16 @@ class LabelStore:
 
     def _open(self, name: str, path: Path) -> Sidecar:
         """Labels that there are, carried to where new ones go."""
+        self._known[name] = _mark(path)
         found = Sidecar.find(self.root, name, self.content, self.repo_id)
         if found is None:
             return self._of_column(name)
         if not path.exists():
-            found.write(path, self.repo_id, self.content)
+            self._write_file(name, found)
             logger.warning("the labels %r of %s were carried over to %s", name, self.repo_id, path)
         elif found.left:
             aside = _keep_aside(path)
-            found.write(path, self.repo_id, self.content)
+            self._write_file(name, found)
             logger.warning(
                 "%s has labels of %d episodes that this dataset lacks or that look alike; they are kept in %s, and "
                 "the labels of all other episodes were carried over", path, found.left, aside,
@@ -154,6 +157,7 @@ class LabelStore:
         if first is not None:
             failure[:first], failure[first:] = SAFE, FAILING
         with self._lock:
+            self._catch_up(specification)
             now = self.verdict(specification, episode)
             if seen is not None and seen != now.at:
                 if now.first == first and not now.mixed:
@@ -169,6 +173,7 @@ class LabelStore:
     def label_frames(self, specification: str, failure: dict[int, np.ndarray], by: str) -> None:
         """Save whole label vectors of many episodes at once, as automatic labellers make them."""
         with self._lock:
+            self._catch_up(specification)
             sidecar = self._files[specification]
             saved = [array.copy() for array in (sidecar.failure, sidecar.by, sidecar.at)]
             try:
@@ -189,6 +194,7 @@ class LabelStore:
             OSError: not saved; the labels are as before, in memory and on disk.
         """
         with self._lock:
+            self._catch_up(specification)
             before = self._files[specification]
             self._files[specification] = after = before.updated(labels)
             try:
@@ -208,6 +214,7 @@ class LabelStore:
         with self._lock:
             if not self._undo[specification, tab]:
                 return None
+            self._catch_up(specification)
             episode, before, after_at = self._undo[specification, tab].pop()
             now = self.verdict(specification, episode)
             if now.at != after_at:
@@ -246,8 +253,31 @@ class LabelStore:
         # A new state has a time of its own even if the clock stands still or was set back.
         sidecar.at[span] = max(time.time_ns() // 1000, int(sidecar.at.max()) + 1) if at is None else at
 
+    def _catch_up(self, specification: str) -> None:
+        """Take in what another program wrote into the file meanwhile, in spite of the lock; the later verdict counts.
+
+        Raises:
+            OSError: what it wrote cannot be read; nothing is overwritten.
+        """
+        path = self._paths[specification]
+        mark = _mark(path)
+        if mark in (None, self._known[specification]):
+            return
+        try:
+            written = Sidecar.read(path, self.content, self.repo_id)
+        except LabelFileError as e:
+            raise OSError(f"another program wrote to {path} meanwhile, and the label was not saved: {e}") from e
+        logger.warning("another program wrote to %s meanwhile; its labels and these are kept, the later ones", path)
+        self._files[specification] = self._files[specification].updated(written)
+        self._known[specification] = mark
+
     def _save(self, specification: str) -> None:
-        self._files[specification].write(self._paths[specification], self.repo_id, self.content)
+        self._write_file(specification, self._files[specification])
+
+    def _write_file(self, specification: str, labels: Sidecar) -> None:
+        path = self._paths[specification]
+        labels.write(path, self.repo_id, self.content)
+        self._known[specification] = _mark(path)
 
 
 def own_folder(folder: Path, root: Path) -> FileLock:
@@ -280,6 +310,15 @@ def own_folder(folder: Path, root: Path) -> FileLock:
     return lock
 
 
+def _mark(path: Path) -> tuple[int, ...] | None:
+    """What tells a file from the one that replaced it; None: there is none."""
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        return None
+    return found.st_ino, found.st_size, found.st_mtime_ns
+
+
 def _cannot_write(folder: Path, error: OSError) -> str:
     return (
         f"cannot write labels to {folder} ({error.strerror or error}); make it writable, or copy the dataset to a "
@@ -301,3 +340,10 @@ def first_failing(failure: np.ndarray) -> int | None:
     first = int((failure == SAFE).sum())
     ordered = (failure[:first] == SAFE).all() and (failure[first:] == FAILING).all()
     return first if ordered else None
+
+
+def in_words(first: int | None, length: int) -> str:
+    """A verdict on an episode of so many frames."""
+    if first is None:
+        return "mixed labels"
+    return "never fails" if first == length else f"fails from frame {first}"

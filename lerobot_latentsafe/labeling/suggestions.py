@@ -1,7 +1,9 @@
 """What a trained filter's margin says about episodes: a guess, an order of usefulness, labels that look wrong."""
 
+import logging
 import multiprocessing
 import os
+import signal
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,6 +17,8 @@ from lerobot_latentsafe.datasets.episodes import DatasetFrames
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE
 from lerobot_latentsafe.evaluation.along_episodes import episode_margins
 from lerobot_latentsafe.modeling_latentsafe import load_filter
+
+logger = logging.getLogger(__name__)
 
 WORST = 5
 """Frames an episode is judged by: a short doubt in a long certain episode counts."""
@@ -67,42 +71,75 @@ class Suggester:
     Args:
         on_new: called with the episode whenever one has been judged.
 
+    Attributes:
+        known: episode -> what the filter thinks of it.
+
     Raises:
-        RuntimeError: the filter cannot be loaded or does not fit the dataset.
+        RuntimeError: the filter cannot be loaded or does not fit the dataset, or its process was killed.
     """
 
     def __init__(self, policy_path: str, repo_id: str, root: str | Path, on_new: Callable[[int], None]):
         context = multiprocessing.get_context("spawn")
         receiver, sender = context.Pipe(duplex=False)
         self.known: dict[int, Suggestion] = {}
+        self._silent: dict[int, str] = {}
+        self._ended: str | None = None
+        self._closed = False
         self._process = context.Process(target=_judge, args=(policy_path, repo_id, str(root), sender), daemon=True)
         self._process.start()
         sender.close()
-        answer = receiver.recv()
+        try:
+            answer = receiver.recv()
+        except (EOFError, OSError):
+            answer = self._how_it_ended()
         if isinstance(answer, str):
             raise RuntimeError(f"no suggestions from {policy_path}: {answer}")
         self._collect(*answer)
-        threading.Thread(target=self._listen, args=(receiver, on_new), daemon=True).start()
+        self.listener = threading.Thread(target=self._listen, args=(receiver, on_new), daemon=True)
+        self.listener.start()
 
-    def _collect(self, episode: int, margin: np.ndarray) -> None:
-        self.known[episode] = Suggestion.of(margin)
+    def why_silent(self, episode: int) -> str | None:
+        """Why an episode has no suggestion and will get none; None: it has one, or has not been looked at yet."""
+        return None if episode in self.known else self._silent.get(episode, self._ended)
+
+    def _collect(self, episode: int, margin: np.ndarray | str) -> None:
+        if isinstance(margin, str):
+            self._silent[episode] = margin
+        else:
+            self.known[episode] = Suggestion.of(margin)
 
     def _listen(self, receiver, on_new: Callable[[int], None]) -> None:
         while True:
             try:
-                episode, margin = receiver.recv()
+                answer = receiver.recv()
             except (EOFError, OSError, ValueError):
-                return
-            self._collect(episode, margin)
-            on_new(episode)
+                self._process.join()
+                answer = self._how_it_ended() if self._process.exitcode else None
+            if not isinstance(answer, tuple):
+                break
+            self._collect(*answer)
+            on_new(answer[0])
+        if answer and not self._closed:
+            self._ended = answer
+            logger.warning("no more suggestions: %s", answer)
+
+    def _how_it_ended(self) -> str:
+        self._process.join()
+        code = self._process.exitcode
+        how = f"was killed ({signal.Signals(-code).name})" if code < 0 else f"ended with exit code {code}"
+        return (
+            f"the process that runs the filter {how}; a system that is short of memory does so. Free some memory, or "
+            "label without --policy.path"
+        )
 
     def close(self) -> None:
         """Stop judging."""
+        self._closed = True
         self._process.terminate()
 
 
 def _judge(policy_path: str, repo_id: str, root: str, sender) -> None:
-    """The other process: sends (episode, margin), or why it cannot."""
+    """The other process: sends (episode, margin), (episode, why it has none), or why it cannot judge at all."""
     if hasattr(os, "nice"):
         os.nice(10)
     try:

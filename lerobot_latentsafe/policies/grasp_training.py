@@ -24,7 +24,7 @@ from lerobot_latentsafe.datasets.frame_cache import FrameCache, FrameCacheError
 from lerobot_latentsafe.encoders.perception import PerceptionConfig
 from lerobot_latentsafe.policies.grasp_prediction import GraspPredictionStep, GraspPredictor, TwoValuedStep
 from lerobot_latentsafe.runtime.checkpoint import read_config
-from lerobot_latentsafe.runtime.files import refuse_existing
+from lerobot_latentsafe.runtime.files import refuse_existing, replacing_folder
 
 SWITCH = "gripper.pos"
 """The command whose falling is aimed at."""
@@ -104,11 +104,12 @@ def with_aim(
     aim = learned_from(torch.ones_like(odd)).cpu()
     seen = aim.in_detail(seen)
     feature = {"dtype": "float32", "shape": (seen.shape[1],), "names": None}
-    copy = add_features(
-        dataset, {OBS_ENV_STATE: (seen.numpy(), feature)}, output_dir=output_dir, repo_id=f"{repo_id}_seen"
-    )
-    save_file(aim.state_dict(), Path(output_dir) / AIM, metadata={"fingerprint": cache.manifest["fingerprint"]})
-    return copy
+    with replacing_folder(output_dir) as folder:
+        copy = add_features(
+            dataset, {OBS_ENV_STATE: (seen.numpy(), feature)}, output_dir=folder, repo_id=f"{repo_id}_seen"
+        )
+        save_file(aim.state_dict(), folder / AIM, metadata={"fingerprint": cache.manifest["fingerprint"]})
+    return LeRobotDataset(copy.repo_id, root=output_dir)
 
 
 def _motions_until_grasp(
@@ -170,8 +171,9 @@ def let_see(checkpoint: str | Path, cache_root: str | Path, seen: str | Path, ou
     pre.steps.insert(at, step)
     if levels := two_valued(cache.action):
         post.steps.append(TwoValuedStep(levels))
-    output_dir.mkdir(parents=True)
-    config.save_pretrained(output_dir)
-    shutil.copyfile(checkpoint / "model.safetensors", output_dir / "model.safetensors")
-    for pipeline in (pre, post):
-        pipeline.save_pretrained(output_dir)
+    with replacing_folder(output_dir) as folder:
+        folder.mkdir()
+        config.save_pretrained(folder)
+        shutil.copyfile(checkpoint / "model.safetensors", folder / "model.safetensors")
+        for pipeline in (pre, post):
+            pipeline.save_pretrained(folder)

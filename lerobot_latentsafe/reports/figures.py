@@ -9,12 +9,13 @@ from matplotlib.figure import Figure
 from lerobot_latentsafe.dubins import car
 from lerobot_latentsafe.evaluation.rollouts import Episodes
 from lerobot_latentsafe.evaluation.statistics import wilson
+from lerobot_latentsafe.runtime.files import replacing, scratch_folder
 
 
 def save(figure: Figure, path: str | Path) -> None:
-    """Write a PNG, making folders as needed."""
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110, bbox_inches="tight")
+    """Write a PNG, or what the name ends in, making folders as needed."""
+    with replacing(path) as partial:
+        figure.savefig(partial, format=Path(path).suffix.removeprefix(".") or "png", dpi=110, bbox_inches="tight")
     plt.close(figure)
 
 
@@ -103,7 +104,6 @@ def write_side_by_side(columns: dict[str, tuple[list[np.ndarray], list[bool]]], 
     import cv2
     from lerobot.utils.io_utils import write_video
 
-    path.parent.mkdir(parents=True, exist_ok=True)
     length, drawn = max(len(frames) for frames, _ in columns.values()), []
     for name, (frames, acted) in columns.items():
         frames = [cv2.resize(f, (256, 256), interpolation=cv2.INTER_NEAREST) for f in frames]
@@ -112,5 +112,7 @@ def write_side_by_side(columns: dict[str, tuple[list[np.ndarray], list[bool]]], 
             if t < len(acted) and acted[t]:
                 cv2.rectangle(frame, (0, 0), (255, 255), (255, 140, 0), 6)
         drawn.append(frames + [frames[-1]] * (length - len(frames)))
-    write_video(str(path), [np.concatenate(pair, 1) for pair in zip(*drawn)], fps)
+    with replacing(path) as partial, scratch_folder(path) as scratch:
+        write_video(scratch / path.name, [np.concatenate(pair, 1) for pair in zip(*drawn)], fps)
+        (scratch / path.name).replace(partial)
     return path

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from lerobot_latentsafe.runtime.files import replacing
+
 STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
 table { border-collapse: collapse; margin: 1rem 0; } td, th { padding: .3rem .8rem; text-align: left; }
@@ -176,9 +178,9 @@ def _encoded(path: Path) -> str:
 
 
 def write_report(path: str | Path, title: str, parts: list[str]) -> None:
-    """Write the page."""
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    """Write the page; one that was there stays until this one is whole."""
     head = f"<!doctype html><html lang=en><meta charset=utf-8><title>{html.escape(title)}</title><style>{STYLE}</style>"
     script = SCRIPT.replace("WIDTH", str(WIDTH)).replace("LEFT", str(LEFT))
     body = f"<h1>{html.escape(title)}</h1>{''.join(parts)}<script>{script}</script>"
-    Path(path).write_text(f"{head}{body}</html>", encoding="utf-8")
+    with replacing(path) as partial:
+        partial.write_text(f"{head}{body}</html>", encoding="utf-8")

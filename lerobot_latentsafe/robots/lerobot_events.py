@@ -1,34 +1,27 @@
-"""Events of LeRobot's loops, heard in what they log: no call tells a robot that an episode begins."""
+"""Events of LeRobot's loops, seen in which of them is calling: no call tells a robot that an episode begins.
 
-import logging
+What they log is no ground to decide on: any library may log the same, and a user may silence it.
+"""
 
-from lerobot_latentsafe._compat import RECORDING, RESETTING, RETURNING
+from lerobot_latentsafe._compat import Loop, calling_loop
 
 
-class LeRobotEvents(logging.Handler):
-    """Hears in LeRobot's log when an episode begins or ends, between `listen` and `stop`."""
+class LeRobotEvents:
+    """Notices when LeRobot begins or ends an episode; ask it in every call that LeRobot's loops make."""
 
     def __init__(self) -> None:
-        super().__init__(logging.INFO)
-        self._heard: int | str | None = None
+        self._last: Loop | None = None
 
-    def listen(self) -> None:
-        """Begin to hear what LeRobot logs."""
-        logging.getLogger().addHandler(self)
+    def take(self) -> Loop | None:
+        """The loop that is calling, if it is another than the one that called last; None also if none of them is."""
+        loop = calling_loop()
+        if loop is None or loop == self._last:
+            return None
+        self._last = loop
+        return loop
 
-    def stop(self) -> None:
-        """Hear nothing any more."""
-        logging.getLogger().removeHandler(self)
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Note what a line of the log announces, if anything."""
-        said = str(record.msg)
-        if recording := RECORDING.match(said):
-            self._heard = int(recording[1])
-        elif said.startswith((RESETTING, RETURNING)):
-            self._heard = RESETTING if said.startswith(RESETTING) else RETURNING
-
-    def take(self) -> int | str | None:
-        """The last event since the last call: the number of an episode that begins, `RESETTING` or `RETURNING`."""
-        heard, self._heard = self._heard, None
-        return heard
+    @property
+    def between_episodes(self) -> bool:
+        """Whether the very call comes from a loop that moves a robot between episodes."""
+        loop = calling_loop()
+        return loop is not None and loop.episode is None

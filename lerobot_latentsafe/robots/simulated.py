@@ -15,17 +15,19 @@ from lerobot_latentsafe.robots.uncalibrated import Uncalibrated
 class SimulatedRobot(Uncalibrated, Robot):
     """One control step of physics for every action, however fast the caller runs.
 
-    LeRobot's recording has no call that resets a scene: it *says* when an episode begins, to a person. The simulation
-    listens to the same announcement, and then starts from the episode's own seed, so that any teleoperator can record
-    and any recorded episode can be replayed (`--robot.seed=<seed + episode>`).
+    LeRobot's recording has no call that resets a scene. The simulation notices which of LeRobot's loops calls, and
+    starts each episode from the episode's own seed, so that any teleoperator can record and any recorded episode can
+    be replayed (`--robot.seed=<seed + episode>`).
 
     Attributes:
+        slack_s: seconds by which an observation may be older than a period under a filter: nothing real is late.
         camera_names: of the scene's cameras.
         state_names: of the numbers that the scene measures.
         scene: the simulation, or None while not connected. Its `truth()` is for labels and evaluation only.
         episode: counts resets, for operators who want to know when to begin anew.
     """
 
+    slack_s = 0.4
     camera_names: tuple[str, ...]
     state_names: list[str]
 
@@ -74,7 +76,6 @@ class SimulatedRobot(Uncalibrated, Robot):
         scene.render(self.camera_names[0])  # fails here, not in the middle of an episode, where nothing can draw
         self.scene = scene
         self.episode += 1
-        self._events.listen()
         _connected.append(self)
 
     def reset(self, seed: int) -> None:
@@ -84,11 +85,11 @@ class SimulatedRobot(Uncalibrated, Robot):
         self.episode += 1
 
     def get_observation(self) -> dict:
-        """State and pictures; begins an episode that LeRobot has announced."""
+        """State and pictures; begins an episode that LeRobot begins."""
         self._require_connection()
-        announced = self._events.take()
-        if isinstance(announced, int):
-            self.reset(self.config.seed + announced)
+        loop = self._events.take()
+        if loop is not None and loop.episode is not None:
+            self.reset(self.config.seed + loop.episode)
         state = dict(zip(self.state_names, self.scene.proprioception().tolist()))
         return {**state, **{camera: self.scene.render(camera) for camera in self.camera_names}}
 
@@ -111,7 +112,6 @@ class SimulatedRobot(Uncalibrated, Robot):
     def disconnect(self) -> None:
         """Close the scene."""
         self._require_connection()
-        self._events.stop()
         _connected.remove(self)
         self.scene.close()
         self.scene = None

@@ -347,6 +347,7 @@ def writing_checkpoint(folder: str | Path) -> Iterator[Path]:
     try:
         if not folder.exists() or not any(folder.iterdir()):
             with replacing_folder(folder) as partial:
+                partial.mkdir()
                 yield partial
             return
         with TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as partial:

@@ -5,6 +5,7 @@ from lerobot_latentsafe.latent import Latent
 from lerobot_latentsafe.world_models.base import WorldModel, WorldModelConfig
 from lerobot_latentsafe.world_models.dino_wm import DinoWM, DinoWMConfig
 from lerobot_latentsafe.world_models.gru import FrameGRU, GRUConfig
+from lerobot_latentsafe.world_models.none import NoneConfig, NoWorldModel
 from lerobot_latentsafe.world_models.rssm import RSSM, RSSMConfig
 
 __all__ = [
@@ -15,6 +16,8 @@ __all__ = [
     "FrameGRU",
     "GRUConfig",
     "Latent",
+    "NoWorldModel",
+    "NoneConfig",
     "RSSMConfig",
     "WorldModel",
     "WorldModelConfig",

@@ -28,11 +28,17 @@ from lerobot_latentsafe.experiments.blocks.replay import CAMERA_KEYS, Replay, ex
 from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES
 from lerobot_latentsafe.policies.dreamer.configuration_dreamer import LatentSafeDreamerConfig
 from lerobot_latentsafe.policies.dreamer.modeling_dreamer import LatentSafeDreamerPolicy
+from lerobot_latentsafe.runtime.files import claim, discard, locked_folder, replacing, replacing_folder
 from lerobot_latentsafe.runtime.hub import save_policy
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
+from lerobot_latentsafe.runtime.options import require_at_least
 from lerobot_latentsafe.safety_model import SafetyModel
 
 OPTIONS, LOG = "options.json", "log.jsonl"
+LEAST = dict.fromkeys(
+    ("demonstrations", "steps", "collect_every", "n_envs", "batch_size", "save_every", "log_every"), 1
+) | dict.fromkeys(("pretraining", "workers", "seed"), 0)
+"""Option -> its least value."""
 
 
 @dataclass
@@ -87,8 +93,12 @@ class TrainDreamer:
                 raise ValueError(f"--{name}.type is {found!r}; expected {wanted}")
         if self.model.world_model.type != "rssm":
             raise ValueError(f"--model.world_model.type is {self.model.world_model.type!r}; expected 'rssm'")
-        if not 0 <= self.pretraining <= self.steps:
+        for name, least in LEAST.items():
+            require_at_least(f"--{name}", getattr(self, name), least)
+        if self.pretraining > self.steps:
             raise ValueError(f"--pretraining is {self.pretraining}; expected 0 to --steps, {self.steps}")
+        if not 0 <= self.demonstration_share <= 1:
+            raise ValueError(f"--demonstration_share is {self.demonstration_share}; expected 0 to 1")
 
     @property
     def n_rounds(self) -> int:
@@ -97,7 +107,8 @@ class TrainDreamer:
 
     def run(self) -> None:
         """Train, or go on training, and say where the results are."""
-        DreamerTraining(self).run()
+        with locked_folder(self.output_dir):
+            DreamerTraining(self).run()
         print(f"task policy in {self.output_dir / 'policy'}, its episodes in {self.output_dir / 'episodes'}")
 
 
@@ -117,6 +128,7 @@ class DreamerTraining:
         self.coming: Iterable[tuple[int, dict[str, np.ndarray]]] = []
         self._record_demonstrations()
         self._load() if self._checkpoints() else self._begin()
+        self._forget_later_rows()
         if device == "cpu":
             keep_freed_memory()
         else:
@@ -137,8 +149,8 @@ class DreamerTraining:
                 self._save()
         self.policy.eval()
         if not (self.folder / "policy").exists():
-            save_policy(self.policy, self.folder / "policy.unfinished")
-            (self.folder / "policy.unfinished").rename(self.folder / "policy")
+            with replacing_folder(self.folder / "policy") as folder:
+                save_policy(self.policy, folder)
         if not (self.folder / "episodes").exists():
             export(self.replay, len(self.replay.written), self.folder / "episodes", options.repo_id, self.scene)
         self._note({"simulator_steps": len(self.replay.written) * self.replay.length})
@@ -306,13 +318,11 @@ class DreamerTraining:
         """Write a checkpoint whole, then drop the one before; a round that is being recorded is kept, too."""
         self._finish_round()
         before = self._checkpoints()
-        partial = self.folder / "checkpoints" / "unfinished"
-        shutil.rmtree(partial, ignore_errors=True)
-        save_policy(self.policy, partial / "policy")
-        save_optimizer_state(self.optimizers, partial / "optimizers")
-        partial.rename(self.folder / "checkpoints" / f"{self.step:07d}")
+        with replacing_folder(self.folder / "checkpoints" / f"{self.step:07d}") as folder:
+            save_policy(self.policy, folder / "policy")
+            save_optimizer_state(self.optimizers, folder / "optimizers")
         for folder in before:
-            shutil.rmtree(folder)
+            discard(folder)
 
     def _load(self) -> None:
         folder = self._checkpoints()[-1]
@@ -323,20 +333,26 @@ class DreamerTraining:
         """Note what this folder's run is, and refuse to go on with another.
 
         Raises:
-            ValueError: the folder holds a run with other options.
+            OtherRunError: the folder holds a run with other options.
         """
         wanted = json.loads(json.dumps(draccus.encode(self.options)))
         for name in ("output_dir", "log_every", "workers", "cuda_graph"):
             del wanted[name]
-        note = self.folder / OPTIONS
-        if note.exists() and (known := json.loads(note.read_text())) != wanted:
-            names = [k for k in wanted if known.get(k) != wanted[k]]
-            raise ValueError(
-                f"{self.folder} holds a run with other options ({', '.join(names)}), which a resumed one would mix; "
-                "choose another --output_dir or delete it"
-            )
-        self.folder.mkdir(parents=True, exist_ok=True)
-        note.write_text(json.dumps(wanted, indent=2))
+        claim(self.folder / OPTIONS, wanted)
+
+    def _forget_later_rows(self) -> None:
+        """Take from the log what will be done again, and a line that was torn."""
+        log = self.folder / LOG
+        lines = log.read_text().splitlines() if log.exists() else []
+        with replacing(log) as partial:
+            partial.write_text("".join(f"{line}\n" for line in lines if self._is_past(line)))
+
+    def _is_past(self, line: str) -> bool:
+        try:
+            row = json.loads(line)
+        except ValueError:
+            return False
+        return row["step"] <= self.step and "simulator_steps" not in row
 
     def _note(self, row: dict) -> None:
         row = {"step": self.step, "cpu_s": round(time.process_time() - self.started), **row}

@@ -1,6 +1,5 @@
 """Episodes of one scene on disk, small pictures and all, in the order in which they were recorded."""
 
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +22,7 @@ from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES, action_
 from lerobot_latentsafe.franka.scene import FrankaScene
 from lerobot_latentsafe.policies.dreamer.behavior import TERMS
 from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
-from lerobot_latentsafe.runtime.files import refuse_existing
+from lerobot_latentsafe.runtime.files import allocate, replacing_folder
 from lerobot_latentsafe.units import Units
 
 CAMERA_KEYS = ("observation.images.front", "observation.images.wrist")
@@ -73,9 +72,9 @@ class Replay:
         length: frames of an episode.
     """
 
-    arrays: dict[str, np.ndarray]
+    arrays: dict[str, np.memmap]
     percepts: dict[str, torch.Tensor]
-    written: np.ndarray
+    written: np.memmap
     length: int
 
     @classmethod
@@ -100,24 +99,26 @@ class Replay:
         for name, (shape, dtype) in shapes.items():
             file = folder / f"{name}.npy"
             if not file.exists():
-                np.lib.format.open_memmap(file, mode="w+", dtype=dtype, shape=shape).flush()
+                allocate(file, dtype, shape)
             arrays[name] = np.load(file, mmap_mode="r+")
             if arrays[name].shape != shape:
                 raise ValueError(
                     f"{file} has shape {arrays[name].shape}, expected {shape}: it is of a run with other sizes; choose "
-                    "another --output_dir or delete it"
+                    "another --output_dir"
                 )
         percepts = {key: torch.from_numpy(arrays[key]).to(device) for key in CAMERA_KEYS}
         return cls(arrays, percepts, arrays.pop("written"), length)
 
     def write(self, i: int, episode: dict[str, np.ndarray]) -> None:
-        """Store episode i. A killed process loses nothing of it: the system keeps mapped pages."""
+        """Store episode i: when it is told to be written, all of it is on disk."""
         frames = slice(i * self.length, (i + 1) * self.length)
         for name, values in episode.items():
             self.arrays[name][frames] = values
+            self.arrays[name].flush()
         for key, pictures in self.percepts.items():
             pictures[frames] = torch.from_numpy(episode[key]).to(pictures.device)
         self.written[i] = True
+        self.written.flush()
 
     def reader(self, n_episodes: int, clip_length: int, units: Units) -> ClipReader:
         """Clips of the first so many episodes, in these units."""
@@ -155,18 +156,15 @@ def export(replay: Replay, n_episodes: int, root: Path, repo_id: str, scene: Fra
     Raises:
         FileExistsError: root exists.
     """
-    refuse_existing(root)
-    begun = root.with_name(f"{root.name}.begun")
-    shutil.rmtree(begun, ignore_errors=True)
-    _write_dataset(replay, n_episodes, begun, repo_id, scene)
-    folder = begun / FOLDER
-    folder.mkdir()
-    for name in (*CAMERA_KEYS, "state", "action"):
-        np.save(folder / f"{name}.npy", replay.arrays[name][: n_episodes * replay.length])
-    seen = {key: [scene.image_size, scene.image_size, 3] for key in CAMERA_KEYS}
-    kept = {"image_size": replay.arrays[CAMERA_KEYS[0]].shape[-1], "percepts": list(CAMERA_KEYS)}
-    write_manifest(begun, LeRobotDatasetMetadata(repo_id, root=begun), seen, kept)
-    begun.rename(root)
+    with replacing_folder(root) as begun:
+        _write_dataset(replay, n_episodes, begun, repo_id, scene)
+        folder = begun / FOLDER
+        folder.mkdir()
+        for name in (*CAMERA_KEYS, "state", "action"):
+            np.save(folder / f"{name}.npy", replay.arrays[name][: n_episodes * replay.length])
+        seen = {key: [scene.image_size, scene.image_size, 3] for key in CAMERA_KEYS}
+        kept = {"image_size": replay.arrays[CAMERA_KEYS[0]].shape[-1], "percepts": list(CAMERA_KEYS)}
+        write_manifest(begun, LeRobotDatasetMetadata(repo_id, root=begun), seen, kept)
 
 
 def _write_dataset(replay: Replay, n_episodes: int, root: Path, repo_id: str, scene: FrankaScene) -> None:

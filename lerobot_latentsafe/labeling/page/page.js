@@ -314,9 +314,11 @@ function showRow(episode) {
     entry.first === length(episode) ? "safe" : `fails ${entry.first}`;
   text.classList.toggle("odd", entry.first !== null && entry.contradiction > 0.7);
   row.title = [entry.by && `${entry.by}${entry.at ? `, ${new Date(entry.at / 1000).toLocaleString()}` : ""}`,
-    entry.contradiction > 0.7 && "the filter disagrees with this label"].filter(Boolean).join("; ");
+    entry.contradiction > 0.7 && "the filter disagrees with this label", noSuggestion(entry)].filter(Boolean).join("; ");
   row.hidden = $("only-open").checked && !isOpen(episode) && episode !== current;
 }
+
+const noSuggestion = ({ silent }) => silent && `no suggestion, because ${silent}`;
 
 function showVerdict() {
   const entry = entries[current], says = $("verdict");
@@ -411,7 +413,8 @@ function drawTimeline() {
     }
   } else {
     c.fillStyle = COLOUR.dim; c.font = "11px system-ui, sans-serif";
-    c.fillText(dataset.suggestions ? "the filter has not looked at this episode yet" : "time line: click or drag", 6, 15);
+    const waiting = dataset.suggestions ? "the filter has not looked at this episode yet" : "time line: click or drag";
+    c.fillText(noSuggestion(entries[current]) ?? waiting, 6, 15);
   }
   c.fillStyle = "#fff";
   c.fillRect((frame + 0.5) * step - 1, 0, 2, height);

@@ -2,8 +2,15 @@
 
 from dataclasses import dataclass, field
 
+import numpy as np
 from lerobot.cameras import CameraConfig
 from lerobot.robots.config import RobotConfig
+
+POSITIVE = (
+    "fps", "max_lead", "max_lead_turn", "stiffness", "turning_stiffness", "force_threshold", "torque_threshold",
+    "gripper_force", "watchdog",
+)  # fmt: skip
+"""Options that are numbers more than 0."""
 
 
 @RobotConfig.register_subclass("latentsafe_franka")
@@ -48,13 +55,16 @@ class LatentSafeFrankaConfig(RobotConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if any(low >= high for low, high in zip(self.workspace_low, self.workspace_high)):
-            raise ValueError(
-                f"workspace_low {self.workspace_low} must be below workspace_high {self.workspace_high} on every axis"
-            )
-        for name in ("fps", "max_lead", "max_lead_turn", "stiffness", "turning_stiffness", "watchdog"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} is {getattr(self, name)}; expected more than 0")
+        low, high = self.workspace_low, self.workspace_high
+        if not (np.isfinite([*low, *high]).all() and np.less(low, high).all()):
+            raise ValueError(f"workspace_low {low} must be below workspace_high {high} on every axis, both finite")
+        for name in POSITIVE:
+            if not 0 < getattr(self, name) < np.inf:
+                raise ValueError(f"{name} is {getattr(self, name)}; expected a number more than 0")
+        if not np.isfinite(self.tool_offset):
+            raise ValueError(f"tool_offset is {self.tool_offset}; expected a number of metres")
+        if self.max_recoveries < 0:
+            raise ValueError(f"max_recoveries is {self.max_recoveries}; expected 0 or more")
         if self.watchdog < 1.5 / self.fps:
             raise ValueError(
                 f"watchdog is {self.watchdog} s; at {self.fps} Hz expected at least {1.5 / self.fps:.3f} s"

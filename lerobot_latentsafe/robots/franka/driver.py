@@ -3,6 +3,7 @@
 Poses are of the tool centre between the fingertips, in the robot's base frame; quaternions are (x, y, z, w).
 """
 
+import logging
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -12,9 +13,15 @@ from scipy.spatial.transform import Rotation
 from lerobot_latentsafe.franka.actions import GRIPPER_SPEED, GRIPPER_WIDTH
 from lerobot_latentsafe.robots.franka.config_franka import LatentSafeFrankaConfig
 
+logger = logging.getLogger(__name__)
+
 
 class FrankaError(RuntimeError):
     """The arm stopped: a reflex (collision, limits), the user stop, or a lost connection."""
+
+
+class ArmFaultError(FrankaError):
+    """No recovery mends it: answers that are late or no numbers, or an arm that stopped and was not connected anew."""
 
 
 class GripperError(RuntimeError):
@@ -70,7 +77,7 @@ class FrankyDriver:
         self.robot: Any = None  # these three are of franky, which need not be installed
         self.gripper: Any = None
         self.tracker: Any = None
-        self._width, self._moving = GRIPPER_WIDTH, None
+        self._width, self._gripping, self._in_joints = GRIPPER_WIDTH, None, False
 
     def connect(self) -> None:
         """Reach robot and gripper; see `FrankaDriver`."""
@@ -112,6 +119,8 @@ class FrankyDriver:
             pose = self.robot.current_pose.end_effector_pose
         if self.tracker is not None and not self.tracker.is_running:
             raise FrankaError("the arm stopped (a reflex, the user stop, or a lost connection)")
+        if not np.isclose(np.linalg.norm(pose.quaternion), 1, atol=1e-2):
+            raise ArmFaultError(f"the arm tells the quaternion {pose.quaternion}; expected one of length 1")
         rotation = Rotation.from_quat(pose.quaternion)
         tool = np.asarray(pose.translation).ravel() + rotation.apply([0, 0, self.config.tool_offset])
         return ArmState(np.asarray(state.q, float).ravel(), tool, rotation, self._read_width())
@@ -125,17 +134,19 @@ class FrankyDriver:
     def move_joints(self, joints: np.ndarray) -> None:
         """Go slowly to joint angles (7,), and wait."""
         self.stop()
+        self._in_joints = True
         with self._arm_errors():
             self.robot.move(self.franky.JointMotion(list(joints)))
+        self._in_joints = False
 
     def move_gripper(self, width: float) -> None:
         """Begin to open or close to a width in m."""
         try:
             if width < 0.5 * self._width:  # closing on something: press, whatever is between the fingers
                 force, any_width = self.config.gripper_force, GRIPPER_WIDTH
-                self._moving = self.gripper.grasp_async(width, GRIPPER_SPEED, force, any_width, any_width)
+                self._gripping = self.gripper.grasp_async(width, GRIPPER_SPEED, force, any_width, any_width)
             else:
-                self._moving = self.gripper.move_async(width, GRIPPER_SPEED)
+                self._gripping = self.gripper.move_async(width, GRIPPER_SPEED)
         except Exception as e:
             raise GripperError(f"the gripper does not move: {e}") from e
 
@@ -149,9 +160,12 @@ class FrankyDriver:
     def stop(self) -> None:
         """Come to rest."""
         tracker, self.tracker = self.tracker, None
-        if tracker is not None:
-            with self._arm_errors():
+        in_joints, self._in_joints = self._in_joints, False
+        with self._arm_errors():
+            if tracker is not None:
                 tracker.stop()
+            if in_joints:  # of a move that nobody waits for any more
+                self.robot.move(self.franky.JointStopMotion(), asynchronous=True)
 
     def disconnect(self) -> None:
         """Stop, and let go of the robot."""
@@ -165,7 +179,18 @@ class FrankyDriver:
             self._width = float(self.gripper.width)
         except Exception as e:
             raise GripperError(f"the gripper does not answer: {e}") from e
+        self._report_gripping()
         return self._width
+
+    def _report_gripping(self) -> None:
+        """Say what became of the hand's last motion, if it failed: it ran in a thread, where nobody hears an error."""
+        if self._gripping is None or not self._gripping.wait(0):
+            return
+        gripping, self._gripping = self._gripping, None
+        try:
+            gripping.get()
+        except Exception as e:
+            logger.warning("the gripper did not do as it was told: %s", e)
 
     def _arm_errors(self):
         return _ArmErrors()

@@ -1,5 +1,6 @@
 """Options of a shielded robot."""
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -46,7 +47,9 @@ class LatentSafeShieldedConfig(RobotConfig):
             person's resets), and commands of which the filter knows nothing, such as joint moves. Otherwise the first
             are filtered like any other, and at the others the robot holds still. Where commands are joint targets,
             what moves the robot between episodes passes anyway, but no joint goes further at once than in the data.
-        journal: a parquet file for every decision of a recording; `latentsafe record` sets it.
+        slack_s: seconds by which an observation may be older than a period when the action leaves, counted from before
+            it was taken. None: what the inner robot declares as its `slack_s`, else 0.
+        journal: a parquet file for every decision, for LeRobot's own loops. `latentsafe record` writes one of its own.
     """
 
     inner: InnerRobotConfig | None = None
@@ -55,6 +58,7 @@ class LatentSafeShieldedConfig(RobotConfig):
     device: str | None = None
     fps: int | None = None
     unfiltered_moves: bool = False
+    slack_s: float | None = None
     journal: Path | None = None
 
     def __post_init__(self) -> None:
@@ -65,3 +69,5 @@ class LatentSafeShieldedConfig(RobotConfig):
             raise ValueError("no filter: give --robot.filter=<folder, Hub id or committed name>")
         if isinstance(self.inner, LatentSafeShieldedConfig):
             raise ValueError("--robot.inner is itself latentsafe_shielded; shields do not nest, give the bare robot")
+        if self.slack_s is not None and not 0 <= self.slack_s < math.inf:
+            raise ValueError(f"--robot.slack_s is {self.slack_s}; expected seconds, 0 or more")

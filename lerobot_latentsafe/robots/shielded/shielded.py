@@ -2,39 +2,32 @@
 
 import logging
 import math
-import time
-from collections import deque
-from statistics import median
+import threading
+from contextlib import suppress
 from typing import Any
 
-import numpy as np
 import torch
-from lerobot.policies.utils import prepare_observation_for_inference
-from lerobot.robots.robot import Robot
 from lerobot.robots.utils import make_robot_from_config
-from lerobot.utils.constants import OBS_IMAGES, OBS_STATE, OBS_STR
-from lerobot.utils.feature_utils import build_dataset_frame
+from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
+from torch import Tensor
 
-from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
 from lerobot_latentsafe.datasets.decisions import Journal
 from lerobot_latentsafe.decision import FilterDecision, Reason
-from lerobot_latentsafe.encoders.pictures import check_proportions
+from lerobot_latentsafe.guard import UnknownPoseError
 from lerobot_latentsafe.modeling_latentsafe import load_filter
 from lerobot_latentsafe.robots.lerobot_events import LeRobotEvents
 from lerobot_latentsafe.robots.shielded.config_shielded import LatentSafeShieldedConfig
-from lerobot_latentsafe.units import TrainedOn
+from lerobot_latentsafe.robots.shielded.fit import check_fit
+from lerobot_latentsafe.robots.shielded.readings import all_finite, as_input, as_number, as_numbers, is_usable
+from lerobot_latentsafe.robots.shielded.wrapped import WrappedRobot
 
 logger = logging.getLogger(__name__)
 
-PAUSE_S = 1.0
-"""After a pause between two decisions longer than this, what was seen before says nothing: the history starts anew."""
-RATE_DECISIONS = 10
-"""So many decisions tell at what rate the loop runs."""
-MOVED = 0.05
-"""A robot has moved if a number of its state differs by this many standard deviations of the data."""
+MAX_FAILURES = 5
+"""So often in a row may the inner robot fail to be read, or to take an action."""
 
 
-class LatentSafeShielded(Robot):
+class LatentSafeShielded(WrappedRobot):
     """To LeRobot it is the inner robot: same name, features, cameras. What is sent to it goes through the filter.
 
     Observations also hold `shield.value`, `shield.margin` (not a number before the first decision) and
@@ -49,9 +42,12 @@ class LatentSafeShielded(Robot):
     config_class = LatentSafeShieldedConfig
     name = "latentsafe_shielded"
 
-    _phase: int | str | None
-    _decided_at: float | None
-    _untaken: dict[str, float] | None
+    _observation: dict | None
+    _decision: FilterDecision | None
+    _untaken: tuple[dict[str, float], FilterDecision | None] | None
+    _recorded: bool
+    _unjudged: bool
+    _unread: int
 
     def __init__(self, config: LatentSafeShieldedConfig):
         super().__init__(config)
@@ -61,62 +57,19 @@ class LatentSafeShielded(Robot):
         self.filter = load_filter(config.filter, law=config.law, device=config.device)
         self.filter.model.require_trained_for_law()
         self._trained_on = self.filter.config.trained_on
-        self._check_fit()
+        check_fit(self.inner, config.filter, self.filter.config, config.fps)
+        pace, declared = self.filter.shield.pace, getattr(self.inner, "slack_s", 0.0)
+        pace.strict, pace.slack_s = True, declared if config.slack_s is None else config.slack_s
         self.journal = Journal(config.journal) if config.journal else None
-        self._events = LeRobotEvents()
+        self._events, self._lock = LeRobotEvents(), threading.RLock()
         self._sent: dict[str, float] = {}
+        self._usable: dict[str, Any] = {}
+        self._unsent = 0
         self._forget()
 
-    def _check_fit(self) -> None:
-        """Refuse a filter of another robot, or of another rate, before anything moves."""
-        filter, fps = self.config.filter, self._trained_on.fps
-        _check_cameras(self.inner, filter, self.filter.config)
-        _check_names(self.inner, filter, self._trained_on)
-        if self.config.fps not in (None, fps):
-            raise ValueError(
-                f"the loop is to run at {self.config.fps} Hz, but the filter {filter} decides {fps} times a second: "
-                f"give --fps={fps} (--dataset.fps={fps} to record)"
-            )
-
-    # -- the inner robot ---
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__") or "inner" not in self.__dict__:
-            raise AttributeError(name)
-        return getattr(self.inner, name)
-
-    @property
-    def observation_features(self) -> dict:
-        """Those of the inner robot."""
-        return self.inner.observation_features
-
-    @property
-    def action_features(self) -> dict:
-        """Those of the inner robot."""
-        return self.inner.action_features
-
-    @property
-    def is_connected(self) -> bool:
-        """Whether the inner robot is."""
-        return "inner" in self.__dict__ and self.inner.is_connected
-
-    @property
-    def is_calibrated(self) -> bool:
-        """Whether the inner robot is."""
-        return self.inner.is_calibrated
-
-    def calibrate(self) -> None:
-        """Calibrate the inner robot."""
-        self.inner.calibrate()
-
-    def configure(self) -> None:
-        """Configure the inner robot."""
-        self.inner.configure()
-
     def connect(self, calibrate: bool = True) -> None:
-        """Connect the inner robot, and listen to LeRobot's events."""
+        """Connect the inner robot."""
         self.inner.connect(calibrate)
-        self._events.listen()
         self._forget()
         _connected.append(self)
 
@@ -124,7 +77,6 @@ class LatentSafeShielded(Robot):
         """Write the journal, and disconnect the inner robot."""
         if self in _connected:
             _connected.remove(self)
-        self._events.stop()
         try:
             if self.journal:
                 self.journal.write()
@@ -134,175 +86,269 @@ class LatentSafeShielded(Robot):
     # -- the loop ---
 
     def get_observation(self) -> dict:
-        """The inner robot's observation, and what was decided last."""
-        announced = self._events.take()
-        if announced is not None:
-            self._forget()
-            self._phase = announced
-            filtered = "does not filter now" if self._between and self.config.unfiltered_moves else "starts anew"
-            logger.info("%s: the filter %s", announced if self._between else f"episode {announced}", filtered)
-            if self.journal:
-                self.journal.hear(announced)
-        self._observation = self.inner.get_observation()
-        self._seen_at = time.perf_counter()
-        self._fresh = True
-        self._watch_cameras()
-        return {**self._observation, **self._shown()}
+        """The inner robot's observation, and what was decided last.
 
-    def _shown(self) -> dict[str, float]:
-        """The last decision as numbers; there from the first tick on, for a display lays out what it sees first."""
-        decision = self.filter.shield.decision
-        if decision is None:
-            return {"shield.value": math.nan, "shield.margin": math.nan, "shield.intervened": 0.0}
-        return {f"shield.{name}": float(getattr(decision, name).item()) for name in ("value", "margin", "intervened")}
+        In the place of what LeRobot cannot use stands what was read last; the filter judges what was read.
+
+        Raises:
+            Exception: what the inner robot raises, at once if it has shown nothing yet in this episode, else at the
+                fifth time in a row; it was told to stay before.
+        """
+        with self._lock:
+            self._follow_lerobot()
+            self._look()
+            return {**self._usable, **self._shown()}
 
     def send_action(self, action: dict[str, float]) -> dict[str, float]:
         """Filter an action and have the inner robot execute the result.
 
         Returns:
-            What was executed.
+            What was executed; what was told, if the robot does not say.
 
         Raises:
-            ValueError: while it records, a command that is not the robot's; nothing was sent.
+            UnknownPoseError: nobody knows where the robot is, and it takes positions; nothing was sent.
+            Exception: what the inner robot raises, at the fifth time in a row.
         """
-        if self.journal and not self._between and set(action) != set(self.action_features):
-            raise ValueError(
-                f"the operator commands {', '.join(action)}; {self.name} takes {', '.join(self.action_features)}. "
-                "Nothing was sent; use a teleoperator of this robot"
-            )
-        shield, names = self.filter.shield, self._trained_on.action_names
-        before = shield.decision
-        sent = self.inner.send_action(self._decide(action))
-        self._sent.update(sent)
-        self._untaken = dict(sent)
-        if self.journal and shield.decision is not None and shield.decision is not before:
-            self.journal.add(shield.decision, [float(sent[name]) for name in names])
-        if set(sent) == set(names) and shield.executed is not None:  # the robot may have clipped it
-            shield.was_executed(torch.tensor([[float(sent[name]) for name in names]], device=self.filter.model.device))
-        return sent
+        with self._lock:
+            self._follow_lerobot()
+            told, decision = self._decide(action)
+            sent = self._execute(told)
+            self._remember(sent, decision)
+            return sent
 
-    def take_sent(self) -> dict[str, float] | None:
-        """What was executed since this was asked last, if anything: for whoever stores it."""
+    def take_sent(self) -> tuple[dict[str, float], FilterDecision | None] | None:
+        """What was executed since this was asked last, with the decision on it, if any: for whoever stores it."""
         sent, self._untaken = self._untaken, None
         return sent
 
-    def _decide(self, action: dict[str, float]) -> dict[str, float]:
-        """What is to be executed instead of an action, or that action itself."""
-        names, shield, period = self._trained_on.action_names, self.filter.shield, 1.0 / self._trained_on.fps
-        known = set(action) == set(names)
-        passes = self.config.unfiltered_moves and (self._between or not known)
-        if (passes or (self._between and self._goes_to_places(action))) and all(map(math.isfinite, action.values())):
-            self._say_once("moves between episodes, or of other names, are not filtered; no joint may jump")
-            return self._bounded(action)
-        if not known:
-            return self._hold(action)
-        if not self._fresh:
-            self.get_observation()
-        self._fresh = False
-        now = time.perf_counter()
-        rate = self._check_rate(now)
-        proposed, age = torch.tensor([[float(action[name]) for name in names]]), self._age(now)
-        if rate == Reason.PASSED and age <= period and shield.adopt(proposed, period):
-            self._say_once("these actions come from a policy under this very filter; they are not filtered again")
+    def _follow_lerobot(self) -> None:
+        """Begin anew where LeRobot begins or ends an episode."""
+        loop = self._events.take()
+        if loop is None:
+            return
+        self._forget()
+        self._recorded = loop.episode is not None
+        if self._recorded:
+            logger.info("episode %d: the filter starts anew", loop.episode)
+        elif self.config.unfiltered_moves:
+            logger.info("between episodes: the filter does not filter now")
+        if self.journal:
+            self.journal.write()
+            self.journal.begin(loop.episode)
+
+    def _look(self) -> None:
+        """Read the inner robot; if that fails a few times, what was read last remains, as old as it is."""
+        began = self.filter.shield.clock()
+        try:
+            seen = dict(self.inner.get_observation())
+        except Exception as e:
+            self._unread += 1
+            if self._observation is None or self._unread >= MAX_FAILURES:
+                self._stay()
+                raise
+            self.filter.shield.note_failure("the robot was not read", e)
         else:
-            batch = prepare_observation_for_inference(self._frame(), self.filter.model.device)
-            shield(batch, proposed, age, fault=rate)
-        return self._carry_out(shield.decision, action)
+            self._unread, self._observation, self._seen_at = 0, seen, began
+            features = self.inner.observation_features
+            lost = [name for name in features if not is_usable(seen.get(name), features[name])]
+            self._usable = {**seen, **{name: self._usable[name] for name in lost if name in self._usable}}
+        self._fresh = True
 
-    @property
-    def _between(self) -> bool:
-        """Whether LeRobot said that what comes belongs to no episode."""
-        return isinstance(self._phase, str)
+    def _shown(self) -> dict[str, float]:
+        """The last decision as numbers; there from the first tick on, for a display lays out what it sees first."""
+        decision = self._decision
+        if decision is None:
+            return {"shield.value": math.nan, "shield.margin": math.nan, "shield.intervened": 0.0}
+        return {f"shield.{name}": float(getattr(decision, name).item()) for name in ("value", "margin", "intervened")}
 
-    def _goes_to_places(self, action: dict[str, float]) -> bool:
-        """Whether an action holds targets only, such as LeRobot's return of an arm to its start."""
-        targets = {command.name for command in self._trained_on.commands if command.meaning == "target"}
-        return bool(action) and set(action) <= targets
+    # -- what is to be executed ---
 
-    def _bounded(self, action: dict[str, float]) -> dict[str, float]:
-        """A move that is not filtered: each of its targets goes no further at once than those of the data."""
-        self._decided_at = -math.inf
-        if self._observation is None:
-            self.get_observation()
-        bounded = dict(action)
-        for command in self._trained_on.commands:
-            name = command.name
-            if command.of_state is not None and name in action:
-                low, high = self._trained_on.motion_ranges[name]
-                start = self._moved.get(name, float(self._observation[command.of_state]))
-                bounded[name] = self._moved[name] = min(max(action[name], start + low), start + high)
-        return bounded
+    def _decide(self, action: Any) -> tuple[dict[str, float], FilterDecision | None]:
+        """What is to be executed instead of an action, or that action itself; and the decision on it, if it is one."""
+        numbers, names = as_numbers(action), self._trained_on.action_names
+        missing, between = {*names} - {*numbers}, self._events.between_episodes
+        known = not missing or (bool(numbers) and {*numbers} <= {*names})
+        if self.filter.config.law.mode == "monitor":  # it never acts
+            return action, self._judge(numbers) if known else None
+        moves = self.config.unfiltered_moves and (between or not known)
+        if (moves or (between and self._goes_to_places(numbers))) and all_finite(numbers):
+            return self._bounded(numbers), None
+        decision = self._judge(numbers) if known else None
+        if decision is None:
+            return self._hold(numbers), None
+        if missing:
+            self._say_once(f"the action lacks {', '.join(sorted(missing))}: it counts as not finite")
+        return self._carry_out(decision, numbers) | self._others(numbers), decision
 
-    def _carry_out(self, decision: FilterDecision, action: dict[str, float]) -> dict[str, float]:
-        """The action of a decision on an action."""
+    def _others(self, numbers: dict[str, float]) -> dict[str, float]:
+        """What an action holds beside the filter's commands, if it is allowed."""
+        more = {name: x for name, x in numbers.items() if name not in self._trained_on.action_names}
+        if more:
+            done = "it is passed on unfiltered" if self.config.unfiltered_moves else "it is left out"
+            self._say_once(f"the filter knows nothing of {', '.join(more)}: {done}")
+        return {name: x for name, x in more.items() if self.config.unfiltered_moves and math.isfinite(x)}
+
+    def _judge(self, numbers: dict[str, float]) -> FilterDecision | None:
+        """The decision on commands, of which those that are missing are not finite; None if there can be none."""
+        if not self._fresh:
+            self._look()
+        self._fresh, shield = False, self.filter.shield
+        if self._unjudged:  # the history does not know how the robot came here
+            shield.reset()
+            self._unjudged = False
+        proposed = torch.tensor([[numbers.get(name, math.nan) for name in self._trained_on.action_names]])
+        batch, age_s = self._batch(), shield.clock() - self._seen_at
+        try:
+            decision = self._adopt(batch, proposed, age_s)
+            if decision is None:
+                fault = Reason.OBSERVATION_STALE if self._unread else Reason.PASSED
+                decision = shield(batch, proposed, age_s, fault=fault)
+        except UnknownPoseError:
+            raise
+        except Exception as e:
+            shield.note_failure("the filter could not decide", e)
+            return None
+        if decision.reason.item() == Reason.WRONG_RATE:
+            fps = self._trained_on.fps
+            self._say_once(f"actions do not come {fps} times a second, as in the data: run the loop at --fps={fps}")
+        self._decision = decision
+        return decision
+
+    def _adopt(self, batch: dict[str, Any], proposed: Tensor, age_s: float) -> FilterDecision | None:
+        """The decision of a policy's shield on the very same, if it came at the rate of the data."""
+        shield = self.filter.shield
+        decision = None if self._unread else shield.adopt(batch, proposed, age_s)
+        if decision is None or shield.pace.tick(shield.clock(), self.filter.config.law.slack_ms) != Reason.PASSED:
+            return None
+        self._say_once("these actions come from a policy under this very filter; they are not filtered again")
+        return decision
+
+    def _carry_out(self, decision: FilterDecision, numbers: dict[str, float]) -> dict[str, float]:
+        """The action of a decision on commands."""
+        names = self._trained_on.action_names
         if not decision.intervened.item() and torch.equal(decision.action, decision.proposed):
-            return action
-        if isinstance(self._phase, int) and self.journal is None:
+            return {name: numbers[name] for name in names}
+        if self._recorded and self._untaken is not None:  # nobody asked what was sent
             self._say_once(
                 "LeRobot stores what was proposed, not what is executed now; `latentsafe record` stores that"
             )
-        return dict(zip(self._trained_on.action_names, decision.action[0].tolist()))
+        return dict(zip(names, decision.action[0].tolist()))
 
-    def _hold(self, action: dict[str, float]) -> dict[str, float]:
-        """Instead of a command of which the filter knows nothing: stay."""
-        self._say_once(
-            f"the filter knows nothing of a command of {', '.join(action)}: "
-            "the robot holds still. --robot.unfiltered_moves=true lets such moves pass unfiltered"
-        )
-        self._decided_at = -math.inf
+    def _goes_to_places(self, numbers: dict[str, float]) -> bool:
+        """Whether an action holds targets only, such as LeRobot's return of an arm to its start."""
+        targets = {command.name for command in self._trained_on.commands if command.meaning == "target"}
+        return bool(numbers) and set(numbers) <= targets
+
+    def _bounded(self, numbers: dict[str, float]) -> dict[str, float]:
+        """A move that is not filtered: each of its targets goes no further at once than those of the data."""
+        self._say_once("moves between episodes, or of other names, are not filtered; no joint may jump")
+        self._unjudged = True
         if self._observation is None:
-            self.get_observation()
+            self._look()
+        pose = dict(zip(self._trained_on.state_names, self._pose()[0].tolist()))
+        bounded = dict(numbers)
+        for command in self._trained_on.commands:
+            name = command.name
+            if command.of_state is not None and name in numbers:
+                low, high = self._trained_on.motion_ranges[name]
+                start = self._moved.get(name, pose[command.of_state])
+                if not math.isfinite(start):
+                    return self._hold(numbers)
+                bounded[name] = self._moved[name] = min(max(numbers[name], start + low), start + high)
+        return bounded
+
+    def _hold(self, numbers: dict[str, float]) -> dict[str, float]:
+        """Instead of a command on which there can be no decision: stay."""
+        self._say_once(
+            f"the filter cannot judge a command of {', '.join(numbers) or 'nothing'}: the robot holds still. "
+            "--robot.unfiltered_moves=true lets moves of other names pass unfiltered"
+        )
+        self._unjudged = True
+        if self._observation is None:
+            self._look()
+        return self._staying()
+
+    def _staying(self) -> dict[str, float]:
+        """Commands that stay.
+
+        Raises:
+            UnknownPoseError: nobody knows what they are.
+        """
         names, units = self._trained_on.action_names, self.filter.model.units
-        told = torch.tensor([[float(self._sent.get(name, math.nan)) for name in names]])
-        state = torch.from_numpy(self._frame()[OBS_STATE])[None]
-        return dict(zip(names, units.hold(state.to(units.device), told.to(units.device))[0].tolist()))
+        told = torch.tensor([[self._sent.get(name, math.nan) for name in names]], device=units.device)
+        pose = self._pose()
+        shown = units.seen(torch.ones_like(pose)).isfinite()
+        unknown = units.frozen & shown & torch.where(told.isfinite(), told, units.seen(pose)).isnan()
+        held = torch.where(unknown, torch.nan, units.hold(pose, told))
+        if not held.isfinite().all():
+            lost = ", ".join(name for name, x in zip(names, held[0].tolist()) if not math.isfinite(x))
+            raise UnknownPoseError(
+                f"{self.name} shows no usable reading of {lost}, and was told nothing yet: nobody knows what would be "
+                "to stay, so nothing was sent. See to the robot's sensors, and start again"
+            )
+        return dict(zip(names, held[0].tolist()))
+
+    # -- the inner robot is told ---
+
+    def _execute(self, told: Any) -> Any:
+        """Tell the inner robot; returns what was executed, as far as it is known."""
+        try:
+            reported = self.inner.send_action(told)
+        except Exception as e:
+            self._unsent += 1
+            if self._unsent >= MAX_FAILURES:
+                raise
+            self.filter.shield.note_failure("the robot did not take an action; whether it is executed is unknown", e)
+            return told
+        self._unsent = 0
+        numbers, wanted = as_numbers(reported), as_numbers(told)
+        if wanted and not (wanted.keys() <= numbers.keys() and all_finite({name: numbers[name] for name in wanted})):
+            self._say_once(f"{self.name} does not say what it executed; what it was told counts as that")
+            return told
+        return reported
+
+    def _remember(self, sent: Any, decision: FilterDecision | None) -> None:
+        """Note what was executed: for the next decision, for whoever stores it, and in the journal."""
+        numbers, names, shield = as_numbers(sent), self._trained_on.action_names, self.filter.shield
+        self._sent.update({name: x for name, x in numbers.items() if math.isfinite(x)})
+        self._untaken = numbers, decision
+        if decision is None:
+            return
+        executed = [numbers.get(name, math.nan) for name in names]
+        if self.journal:
+            self.journal.add(decision, executed)
+        if all(map(math.isfinite, executed)):  # the robot may have clipped it
+            shield.was_executed(torch.tensor([executed], device=self.filter.model.device))
+
+    def _stay(self) -> None:
+        """Tell the robot to stay, if it is known what that is, and it still listens; a monitor tells nothing."""
+        if self.filter.config.law.mode != "monitor":
+            with suppress(Exception):
+                self.inner.send_action(self._staying())
 
     # -- what the filter is told ---
 
-    def _check_rate(self, now: float) -> Reason:
-        """Start anew after a pause; a loop that runs at another rate than the filter is no ground to decide on."""
-        fps, gap = self._trained_on.fps, now - self._decided_at if self._decided_at is not None else 0.0
-        self._decided_at = now
-        if gap > PAUSE_S:
-            logger.info("the filter starts anew after a pause")
-            self.filter.shield.reset()
-            self._gaps.clear()
-        elif gap > 0:
-            self._gaps.append(gap)
-        if len(self._gaps) < RATE_DECISIONS:
-            return Reason.PASSED
-        rate = 1.0 / median(self._gaps)
-        if not fps / 2 < rate < 2 * fps:
-            slow_or_fast = "fewer than half" if rate <= fps / 2 else "more than twice"
-            self._say_once(
-                f"actions come {slow_or_fast} as often as the filter decides, {fps} times a second: run the loop at "
-                f"--fps={fps}"
-            )
-        return Reason.WRONG_RATE if rate >= 2 * fps else Reason.PASSED
+    def _batch(self) -> dict[str, Any]:
+        """The last observation as policies get it, on the CPU; what is missing is left out."""
+        features, seen = self.inner.observation_features, self._observation
+        names = {key: key.removeprefix(f"{OBS_IMAGES}.") for key in self.filter.model.world_model.image_keys}
+        pictures = {
+            key: as_input(seen[name], features[name]) for key, name in names.items() if seen.get(name) is not None
+        }
+        return {**pictures, OBS_STATE: self._state()}
 
-    def _frame(self) -> dict[str, np.ndarray]:
-        """The last observation as LeRobot's datasets name and type it."""
-        names = self._trained_on.state_names
-        state = {"dtype": "float32", "shape": (len(names),), "names": names}
-        pictures = {key: {"dtype": "image"} for key in self.filter.model.world_model.image_keys}
-        return build_dataset_frame({OBS_STATE: state, **pictures}, self._observation, prefix=OBS_STR)
+    def _state(self) -> Tensor:
+        """(1, S) as read last; NaN where nothing usable was."""
+        seen = self._observation or {}
+        return torch.tensor([[as_number(seen.get(name)) for name in self._trained_on.state_names]])
 
-    def _watch_cameras(self) -> None:
-        """Note since when each picture has been the same although the robot moved: such a camera is frozen."""
-        frame, now = self._frame(), self._seen_at
-        units = self.filter.model.units
-        state = units.normalise_state(torch.from_numpy(frame.pop(OBS_STATE)).to(units.device))
-        for key, picture in frame.items():
-            last = self._cameras.get(key)
-            if last is None or not np.array_equal(last["picture"], picture):
-                self._cameras[key] = {"picture": picture, "at": now, "state": state, "repeats": 0}
-            elif ((state - last["state"]).abs() > MOVED).any():
-                last["repeats"] += 1
-
-    def _age(self, now: float) -> float:
-        """Seconds since the observation, or since a camera that repeats itself while the robot moves last changed."""
-        frozen = [camera["at"] for camera in self._cameras.values() if camera["repeats"] > 1]
-        return now - min([self._seen_at, *frozen])
+    def _pose(self) -> Tensor:
+        """(1, S), the last reading of each number of the state that is believed; NaN where there is none."""
+        guard, units = self.filter.shield.guard, self.filter.model.units
+        state = self._state().to(units.device)
+        before = torch.full_like(state, math.nan) if guard.pose is None else guard.pose
+        missed = torch.zeros_like(state) if guard.missed is None else guard.missed
+        return torch.where(units.believable(state, before, missed), state, before)
 
     def _say_once(self, message: str) -> None:
         if message not in self._said:
@@ -312,45 +358,11 @@ class LatentSafeShielded(Robot):
     def _forget(self) -> None:
         """Start an episode: nothing seen, nothing decided."""
         self.filter.shield.reset()
-        self._observation, self._fresh, self._seen_at = None, False, 0.0
-        self._phase = None
-        self._untaken = None
+        self._observation, self._fresh, self._seen_at, self._unread = None, False, 0.0, 0
+        self._decision, self._untaken = None, None
+        self._recorded, self._unjudged = False, False
         self._moved: dict[str, float] = {}
-        self._decided_at = None
-        self._gaps: deque[float] = deque(maxlen=RATE_DECISIONS)
-        self._cameras: dict[str, dict] = {}
         self._said: set[str] = set()
-
-
-def _check_cameras(robot: Robot, filter: str, config: LatentSafeConfig) -> None:
-    """Refuse a robot without a camera that the filter looks through, or with pictures of other proportions."""
-    cameras = [name for name, kind in robot.observation_features.items() if isinstance(kind, tuple)]
-    wanted = [key.removeprefix(f"{OBS_IMAGES}.") for key in config.trained_on.cameras]
-    missing = [name for name in wanted if name not in cameras]
-    if missing:
-        raise ValueError(
-            f"{robot.name} has no camera {', '.join(missing)}; the filter {filter} sees {', '.join(wanted)}, the robot "
-            f"has {', '.join(cameras) or 'none'}. Name its cameras alike, or train a filter for this robot"
-        )
-    for name in wanted:
-        key, (height, width, channels) = f"{OBS_IMAGES}.{name}", robot.observation_features[name]
-        check_proportions(key, (channels, height, width), config.input_features[key].shape)
-
-
-def _check_names(robot: Robot, filter: str, trained_on: TrainedOn) -> None:
-    """Refuse a robot that takes other commands than the filter gives, or does not observe what the filter reads."""
-    if set(trained_on.action_names) != set(robot.action_features):
-        raise ValueError(
-            f"the filter {filter} acts in {', '.join(trained_on.action_names)}; {robot.name} in "
-            f"{', '.join(robot.action_features)}. Train a filter on data of this robot"
-        )
-    scalars = [name for name, kind in robot.observation_features.items() if not isinstance(kind, tuple)]
-    unread = [name for name in trained_on.state_names if name not in scalars]
-    if unread:
-        raise ValueError(
-            f"{robot.name} does not observe {', '.join(unread)}, which the filter {filter} reads; it observes "
-            f"{', '.join(scalars) or 'nothing'}. Train a filter on data of this robot"
-        )
 
 
 _connected: list[LatentSafeShielded] = []

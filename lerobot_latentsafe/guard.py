@@ -1,0 +1,368 @@
+"""The guard: what is wrong with what robots show, and with what they are to do, by the data they were trained on.
+
+It needs no world model. Each rule has its place here: shape and scale, finite, in range, seen, in time; and where the
+answer is to stay, what that is. A shield is a guard with a world model.
+"""
+
+import copy
+import logging
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from lerobot.utils.constants import OBS_STATE
+from torch import Tensor
+
+from lerobot_latentsafe.decision import Reason, first_fault
+from lerobot_latentsafe.encoders.pictures import check_proportions
+from lerobot_latentsafe.looks import Cameras, Response
+from lerobot_latentsafe.safety_model import SafetyModel
+from lerobot_latentsafe.units import AT_REST, Units
+
+logger = logging.getLogger(__name__)
+
+PAUSE_S = 1.0
+"""After a pause between two decisions longer than this, what was seen before says nothing: the history starts anew."""
+COLOUR_TOLERANCE = 1e-3
+"""By so much the numbers of a picture may leave [0, 1], for float errors."""
+
+UNSEEN = (
+    Reason.OBSERVATION_MALFORMED, Reason.OBSERVATION_NOT_FINITE, Reason.OBSERVATION_MISSING, Reason.OBSERVATION_STALE,
+    Reason.OBSERVATION_OUT_OF_RANGE, Reason.OBSERVATION_UNFAMILIAR, Reason.FILTER_FAILED,
+)  # fmt: skip
+"""What is wrong with observations that a world model must not see."""
+
+
+class UnknownPoseError(RuntimeError):
+    """Nobody knows where the robot is, and it takes positions: there is no command that is known to be harmless."""
+
+
+# -- in time ---
+
+
+def standing_still() -> float:
+    """The clock of a simulation that waits for whoever acts: nothing is ever late."""
+    return 0.0
+
+
+class Pace:
+    """When decisions come, and how old what they are made on may be when the action leaves.
+
+    Attributes:
+        period: seconds between two frames of the data.
+        strict: whether a loop of another rate than the data's is no ground to decide on, as with every real robot.
+        slack_s: seconds by which an observation may be older than a period, beyond what the law allows.
+        paused: whether the present decision comes after a pause, so that what was seen before says nothing.
+    """
+
+    def __init__(self, fps: float):
+        self.period, self.strict, self.slack_s = 1.0 / fps, False, 0.0
+        self.forget()
+
+    def forget(self) -> None:
+        """Start an episode."""
+        self.times: deque[float] = deque(maxlen=3)
+        self.paused = False
+
+    def oldest(self, slack_ms: float, n: int = 1) -> float:
+        """Seconds that an observation may be old at most: a period for each of n robots that one call decides for."""
+        return n * self.period + self.slack_s + slack_ms / 1e3
+
+    def tick(self, now: float, slack_ms: float) -> Reason:
+        """Note that a decision begins at `now`, seconds, and tell whether they come at the rate of the data."""
+        gap = now - self.times[-1] if self.times else 0.0
+        self.paused = not -1e-9 <= gap <= PAUSE_S  # a clock that went back, or is no number, tells no pause either
+        if self.paused:
+            self.times.clear()
+        self.times.append(now)
+        if not self.strict:
+            return Reason.PASSED
+        late = gap > 2 * self.period + self.slack_s + slack_ms / 1e3
+        hasty = 0 < gap < self.period / 10 or (len(self.times) == 3 and now - self.times[0] < self.period)
+        return Reason.WRONG_RATE if self.paused or late or hasty else Reason.PASSED
+
+
+# -- seen, and told ---
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What remains of an observation.
+
+    Attributes:
+        images: key -> (B, 3, H, W), as the model takes them.
+        state: (B, S) in robot units; numbers that are not usable are NaN.
+        fault: (B,), the first thing that is wrong, a `Reason`.
+    """
+
+    images: dict[str, Tensor]
+    state: Tensor
+    fault: Tensor
+
+
+def check_plan(units: Units, plan: Tensor, before: Sequence[Tensor] = ()) -> Tensor:
+    """What is wrong with each of the actions that are planned, as far as that can be told before they are due.
+
+    Args:
+        plan: (B, N, A) in robot units.
+        before: the last actions (B, A) before them, at most two, the latest last.
+
+    Returns:
+        (B, N), a `Reason` each.
+    """
+    actions = torch.cat([*(action[:, None] for action in before), plan], 1)
+    leaps = torch.zeros(actions.shape[:2], dtype=torch.bool, device=plan.device)
+    leaps[:, 1:] |= units.leaps(actions[:, 1:], [actions[:, :-1]])
+    leaps[:, 2:] |= units.leaps(actions[:, 2:], [actions[:, :-2], actions[:, 1:-1]])
+    fault = torch.zeros(plan.shape[:2], dtype=torch.long, device=plan.device)
+    fault = first_fault(fault, ~plan.isfinite().all(-1), Reason.ACTION_NOT_FINITE)
+    fault = first_fault(fault, units.beyond(plan).any(-1), Reason.ACTION_OUT_OF_RANGE)
+    return first_fault(fault, leaps[:, len(before) :], Reason.ACTION_JUMPS)
+
+
+class Guard:
+    """Checks what a batch of robots shows and is told, remembering what they showed and were told before.
+
+    Attributes:
+        pose: (B, S) in robot units, the last usable reading of each number of the state; NaN before there was one.
+        missed: (B, S), ticks since then.
+        told: (B, A) in robot units, what the robots were told last.
+        moving: bool (B, A), whether what each target is of has moved since the last tick.
+        stay: (B, A) in robot units, what would have been to stay at the last tick.
+        holding: bool (B, A), commands that were told to stay.
+    """
+
+    def __init__(self, model: SafetyModel):
+        self.model, units = model, model.units
+        self.cameras = Cameras(model.world_model.image_keys, model.config.trained_on.looks)
+        self.response = Response(AT_REST * units.state_step, units.adds_up, units.furthest_unanswered)
+        self._begun = False
+        self._said: set[tuple[str, str]] = set()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget what was seen and told: call at the start of every episode."""
+        self.cameras.reset()
+        self.response.reset()
+        self.pose: Tensor | None = None
+        self.missed: Tensor | None = None
+        self.told: Tensor | None = None
+        self.moving: Tensor | None = None
+        self.stay: Tensor | None = None
+        self.holding: Tensor | None = None
+        self._proposals: deque[Tensor] = deque(maxlen=2)
+
+    def observe(self, observation: dict[str, Any]) -> Seen:
+        """Check what the robots show, and remember their state.
+
+        Args:
+            observation: LeRobot batch: images (B, C, H, W) in [0, 1], observation.state (B, S) in robot units.
+
+        Raises:
+            KeyError, ValueError: the very first observation is none of this robot, or the number of robots changed.
+        """
+        n, broken = self._check_shapes(observation)
+        fault = torch.zeros(n, dtype=torch.long, device=self.model.device)
+        everyone = torch.ones_like(fault, dtype=torch.bool)
+        for reason in broken.values():
+            fault = first_fault(fault, everyone, reason)
+        given = {key: value for key, value in observation.items() if key not in broken}
+        state, finite, believed = self._see_state(given, n)
+        pictures = {}
+        for key in self.model.world_model.image_keys:
+            pictures[key], fault, numbers = self._see_picture(key, given.get(key), fault)
+            finite = finite & numbers
+        fault = first_fault(fault, ~finite, Reason.OBSERVATION_NOT_FINITE)
+        fault = first_fault(fault, ~believed, Reason.OBSERVATION_OUT_OF_RANGE)
+        fault = self._compare(pictures, state, fault)
+        self.response.see(state, self.model.units.unknown(n) if self.told is None else self.told)
+        self._begun = True
+        return Seen({key: self.model.images(picture).clamp(0, 1) for key, picture in pictures.items()}, state, fault)
+
+    def _compare(self, pictures: dict[str, Tensor], state: Tensor, fault: Tensor) -> Tensor:
+        """What is wrong beside the data's pictures, and beside what was shown and told before: faults (B,)."""
+        if pictures:
+            dead, unfamiliar, thumbnails = self.cameras.check(pictures)
+            old = self.cameras.repeats(thumbnails, self.model.units.normalise_state(state))
+            if (dead | unfamiliar).any():
+                self.say_once("; ".join(self.cameras.wrong))
+            fault = first_fault(fault, dead, Reason.OBSERVATION_MISSING)
+            fault = first_fault(fault, unfamiliar, Reason.OBSERVATION_UNFAMILIAR)
+            fault = first_fault(fault, old, Reason.OBSERVATION_STALE)
+        return fault
+
+    def _see_state(self, given: dict[str, Any], n: int) -> tuple[Tensor, Tensor, Tensor]:
+        """The usable numbers of the state (B, S), whether all are finite (B,), and whether all are believed (B,)."""
+        units, shape = self.model.units, (n, len(self.model.units.state_names))
+        if OBS_STATE in given and units.state_names:
+            state = self.model.state(given)
+            finite = torch.isfinite(state).all(-1)
+        else:  # what is wrong is said already
+            state = torch.full(shape, torch.nan, device=self.model.device)
+            finite = torch.ones(n, dtype=torch.bool, device=self.model.device)
+        if self.pose is None:
+            self.pose, self.missed = torch.full_like(state, torch.nan), torch.zeros_like(state)
+        usable = units.believable(state, self.pose, self.missed)
+        state = torch.where(usable, state, torch.nan)
+        self.moving = units.moves(state, self.pose)
+        self.pose, self.missed = torch.where(usable, state, self.pose), (self.missed + 1) * ~usable
+        return state, finite, usable.all(-1)
+
+    def _see_picture(self, key: str, picture: Tensor | None, fault: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """A camera's pictures in [0, 1], what is wrong with them (B,), and whether they are finite (B,)."""
+        model, everyone = self.model, torch.ones_like(fault, dtype=torch.bool)
+        if picture is None:
+            shape = model.config.input_features[key].shape
+            return torch.zeros(len(fault), *shape, device=model.device), fault, everyone
+        picture = model.place(picture)
+        low, high = picture.amin((1, 2, 3)), picture.amax((1, 2, 3))  # aminmax is five times slower
+        finite = torch.isfinite(low) & torch.isfinite(high)  # NaN if anything is
+        colours = finite & (low >= -COLOUR_TOLERANCE) & (high <= 1 + COLOUR_TOLERANCE)
+        if not colours.all():
+            picture = picture.nan_to_num(0.0).clamp(0, 1)
+        return picture, first_fault(fault, finite & ~colours, Reason.OBSERVATION_MALFORMED), finite
+
+    def _check_shapes(self, observation: dict[str, Any]) -> tuple[int, dict[str, Reason]]:
+        """The number of robots, and what is wrong with inputs that cannot be used at all."""
+        inputs = self.model.inputs
+        missing = [key for key in inputs if observation.get(key) is None]
+        wrong = {key: self._wrong_shape(key, observation[key]) for key in inputs if key not in missing}
+        rows = {key: len(observation[key]) for key, why in wrong.items() if why is None}
+        n = len(self.pose) if self.pose is not None else next(iter(rows.values()), None)
+        if self.pose is not None and rows and set(rows.values()).isdisjoint({n}):
+            raise ValueError(
+                f"the batch went from {n} to {next(iter(rows.values()))} robots within an episode; "
+                "call reset() between episodes"
+            )
+        for key, count in rows.items():
+            if count != n:
+                wrong[key] = f"{key} is of {count} robots, expected {n}"
+        if missing and (not self._begun or n is None):
+            raise KeyError(self._lacks(missing, observation))
+        explained = [why for why in wrong.values() if why]
+        if explained and (not self._begun or n is None):
+            raise ValueError(explained[0])
+        for why in [*([self._lacks(missing, observation)] if missing else []), *explained]:
+            self.say_once(why)
+        malformed = {key: Reason.OBSERVATION_MALFORMED for key, why in wrong.items() if why}
+        return n, malformed | dict.fromkeys(missing, Reason.OBSERVATION_MISSING)
+
+    def _wrong_shape(self, key: str, value: Any) -> str | None:
+        """What is wrong with the type and shape of an input, if anything."""
+        if not isinstance(value, Tensor) or value.dtype == torch.bool or value.is_complex():
+            return f"{key} is {_kind(value)}, expected a tensor of numbers"
+        if key == OBS_STATE:
+            size = len(self.model.units.state_names)
+            fits = value.dim() == 2 and value.shape[1] == size
+            return None if fits else f"{key} has shape {tuple(value.shape)}, expected (robots, {size})"
+        if not value.is_floating_point() or value.dim() != 4 or not value.numel():
+            return (
+                f"{key} has shape {tuple(value.shape)} of {value.dtype}, expected (robots, channels, height, width) of "
+                "floats in [0, 1]"
+            )
+        try:
+            check_proportions(key, tuple(value.shape[1:]), self.model.config.input_features[key].shape)
+        except ValueError as e:
+            return str(e)
+        return None
+
+    def _lacks(self, missing: list[str], observation: dict[str, Any]) -> str:
+        return (
+            f"observation lacks {', '.join(missing)}; this filter was trained on {', '.join(self.model.inputs)}. Got "
+            f"{', '.join(key for key in observation if key.startswith('observation'))}. Rename the camera or state "
+            "(--rename_map), or train a filter for this robot"
+        )
+
+    # -- what the robots are to do ---
+
+    def check_action(
+        self, proposed: Any, fault: Tensor, hold: Tensor, missing_reason: Reason, planned: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Faults, the proposal and what of it lies in the data's range: (B,), (B, A), (B, A) in robot units.
+
+        Args:
+            planned: (B, N, A) in robot units, what is to come after the proposal, if that is known.
+        """
+        units, everyone = self.model.units, torch.ones_like(fault, dtype=torch.bool)
+        if proposed is not None and not self._is_action(proposed, hold):
+            proposed, missing_reason = None, Reason.BASE_POLICY_FAILED
+        if proposed is None:
+            fault, proposed = first_fault(fault, everyone, missing_reason), hold
+        proposed = self.model.place(proposed).float()
+        finite = torch.isfinite(proposed).all(-1)
+        fault = first_fault(fault, ~finite, Reason.ACTION_NOT_FINITE)
+        clipped, out_of_range = units.clip(torch.where(finite[:, None], proposed, hold), self.pose)
+        fault = first_fault(fault, out_of_range, Reason.ACTION_OUT_OF_RANGE)
+        fault = first_fault(fault, units.leaps(clipped, self._proposals), Reason.ACTION_JUMPS)
+        if planned is not None:
+            plan = torch.cat([clipped[:, None], self.model.place(planned).float()], 1)
+            found = check_plan(units, plan)[:, 1:]
+            for reason in (Reason.ACTION_NOT_FINITE, Reason.ACTION_OUT_OF_RANGE, Reason.ACTION_JUMPS):
+                fault = first_fault(fault, (found == reason).any(1), reason)
+        self._proposals.append(clipped)
+        mute = self.response.is_missing(clipped)
+        if mute.any():
+            self.say_once("the state stays as it is, whatever is sent: the robot goes no further until it changes")
+        fault = first_fault(fault, mute, Reason.OBSERVATION_STALE)
+        return fault, proposed, self._tell_clipped(proposed, clipped, fault)
+
+    def _is_action(self, proposed: Any, hold: Tensor) -> bool:
+        if isinstance(proposed, Tensor) and not proposed.is_complex() and proposed.shape == hold.shape:
+            return True
+        self.say_once(
+            f"proposed action is {_kind(proposed)}, expected a tensor of shape {tuple(hold.shape)}: "
+            f"{', '.join(self.model.units.action_names)}. The base policy must be of the filter's action space"
+        )
+        return False
+
+    def _tell_clipped(self, proposed: Tensor, clipped: Tensor, fault: Tensor) -> Tensor:
+        """What is executed of proposals that pass; says so once where that is not the proposal itself."""
+        passes = (fault == Reason.PASSED)[:, None]
+        beyond = passes & ((clipped - proposed).abs() > 1e-5 * proposed.abs().clamp(min=1))
+        if beyond.any():
+            names = ", ".join(name for name, any_row in zip(self.model.units.action_names, beyond.any(0)) if any_row)
+            self.say_once("the policy leaves the range of the data a little; what is executed is clipped", names)
+        return torch.where(beyond, clipped, proposed)  # others pass to the bit
+
+    def hold(self, state: Tensor) -> Tensor:
+        """Stay: (B, A) in robot units.
+
+        Args:
+            state: (B, S); numbers that are not usable are NaN.
+
+        Raises:
+            UnknownPoseError: commands are positions, and the robots showed no usable state and were told nothing yet.
+        """
+        settled = ~self.moving if self.holding is None else ~self.moving | self.holding
+        hold = self.model.units.hold(state, self.told, settled)
+        if not hold.isfinite().all() and self.model.config.law.mode != "monitor":
+            raise UnknownPoseError(
+                "the first observation of the episode shows no usable state, and these commands are positions: nobody "
+                "knows where the robot is, so nothing is commanded. See to the robot's sensors, and start again"
+            )
+        self.stay = hold
+        return hold
+
+    def was_told(self, action: Tensor) -> None:
+        """Remember (B, A) in robot units as what the robots were told."""
+        self.told = action
+        self.holding = None if self.stay is None else torch.isclose(action, self.stay)
+
+    def adopt(self, other: "Guard") -> None:
+        """Take over what another guard remembers of the same robots."""
+        for name in ("pose", "missed", "told", "moving", "stay", "holding", "_proposals"):
+            setattr(self, name, copy.copy(getattr(other, name)))
+
+    def say_once(self, what: str, which: str = "") -> None:
+        """Warn of something, once."""
+        if (what, which) not in self._said:
+            self._said.add((what, which))
+            logger.warning("%s%s", what, which and f": {which}")
+
+
+def _kind(value: Any) -> str:
+    if isinstance(value, Tensor):
+        return f"a tensor of shape {tuple(value.shape)} of {value.dtype}"
+    return type(value).__name__

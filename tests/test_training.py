@@ -1,0 +1,174 @@
+"""Training on a frozen world model: killed, started twice, by two at once, with options that mean nothing."""
+
+import shutil
+import threading
+
+import pytest
+import tiny
+import torch
+from safetensors.torch import load_file
+
+from lerobot_latentsafe import training
+from lerobot_latentsafe.cli.options import PolicySource
+from lerobot_latentsafe.cli.train import Cache, TrainMargin, TrainReachability
+from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
+from lerobot_latentsafe.runtime.files import FolderInUseError, locked_folder
+from lerobot_latentsafe.training import train_margin, train_reachability
+
+TRAIN = {"margin": train_margin, "reachability": train_reachability}
+
+
+class Killed(BaseException):
+    pass
+
+
+def killed(*given, **options):
+    raise Killed
+
+
+@pytest.fixture(scope="module")
+def whole(tiny_world_model, tiny_filter, cache_meta, tmp_path_factory):
+    """What undisturbed trainings save."""
+    folder = tmp_path_factory.mktemp("whole") / "margin"
+    train_margin(tiny_world_model, cache_meta, folder)
+    return {"margin": folder, "reachability": tiny_filter}
+
+
+def content(folder):
+    return {p.name: p.read_bytes() for p in folder.iterdir()}
+
+
+@pytest.mark.parametrize("kind", TRAIN)
+@pytest.mark.parametrize("step", ["save_policy", "claim"])
+def test_a_killed_training_ends_as_one_that_was_not(
+    tiny_world_model, whole, cache_meta, tmp_path, monkeypatch, kind, step
+):
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(training, step, killed)
+        TRAIN[kind](tiny_world_model, cache_meta, tmp_path / "out")
+    assert not any(tmp_path.iterdir())
+    TRAIN[kind](tiny_world_model, cache_meta, tmp_path / "out")
+    assert content(tmp_path / "out") == content(whole[kind])
+
+
+@pytest.mark.parametrize("kind", TRAIN)
+def test_what_is_there_already_is_not_trained_again(tiny_world_model, whole, cache_meta, monkeypatch, kind, capsys):
+    before = content(whole[kind])
+    monkeypatch.setattr(training, "seen_and_imagined", killed)
+    monkeypatch.setattr(training, "encoded_starts", killed)
+    found = TRAIN[kind](tiny_world_model, cache_meta, whole[kind])
+    assert isinstance(found, LatentSafePolicy) and content(whole[kind]) == before
+    assert "holds the same already" in capsys.readouterr().out
+    with pytest.raises(FileExistsError, match="another --output_dir"):
+        TRAIN[kind](tiny_world_model, cache_meta, whole[kind], seed=1)
+
+
+TEARS = {
+    "weights cut": lambda folder: (folder / "model.safetensors").write_bytes(b"half"),
+    "no seal": lambda folder: (folder / "integrity.json").unlink(),
+    "empty configuration": lambda folder: (folder / "config.json").write_text(""),
+}
+
+
+@pytest.mark.parametrize("tear", TEARS)
+def test_a_torn_checkpoint_is_moved_aside(tiny_world_model, whole, cache_meta, tmp_path, tear, caplog):
+    out = shutil.copytree(whole["reachability"], tmp_path / "out")
+    TEARS[tear](out)
+    train_reachability(tiny_world_model, cache_meta, out)
+    assert content(out) == content(whole["reachability"])
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "out.torn1"] and "out.torn1" in caplog.text
+
+
+@pytest.mark.parametrize("kind", ["policy", "file"])
+def test_what_is_no_filter_is_left_alone(tiny_world_model, tiny_diffusion, cache_meta, tmp_path, kind):
+    out = tmp_path / "out"
+    shutil.copytree(tiny_diffusion, out) if kind == "policy" else out.mkdir()
+    (out / "precious").write_text("data")
+    with pytest.raises(FileExistsError, match="another --output_dir"):
+        train_reachability(tiny_world_model, cache_meta, out)
+    assert (out / "precious").read_text() == "data"
+
+
+def test_two_at_once_are_told_apart(tiny_world_model, cache_meta, tmp_path):
+    entered, left = threading.Event(), threading.Event()
+
+    def other():
+        with locked_folder(tmp_path / "out"):
+            entered.set()
+            left.wait()
+
+    thread = threading.Thread(target=other)
+    thread.start()
+    entered.wait()
+    with pytest.raises(FolderInUseError, match=r"is writing .*out already"):
+        train_reachability(tiny_world_model, cache_meta, tmp_path / "out")
+    left.set()
+    thread.join()
+
+
+def test_a_critic_that_diverged_is_not_saved(tiny_world_model, cache_meta, tmp_path, monkeypatch):
+    def diverges(policy, *given):
+        with torch.no_grad():
+            next(policy.model.critic.parameters()).fill_(float("nan"))
+
+    monkeypatch.setattr(training, "_learn_critic", diverges)
+    with pytest.raises(
+        FloatingPointError, match=r"SafetyCritic holds numbers that are not finite, so nothing is saved"
+    ):
+        train_reachability(tiny_world_model, cache_meta, tmp_path / "out")
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("steps", [0, -5])
+def test_no_steps_make_no_critic(tiny_world_model, cache_meta, tmp_path, steps):
+    with pytest.raises(ValueError, match=f"--steps is {steps}; expected at least 1"):
+        train_reachability(tiny_world_model, cache_meta, tmp_path / "out", steps=steps)
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_configuration_without_steps_makes_no_critic(tiny_world_model, cache_meta, tmp_path):
+    folder = shutil.copytree(tiny_world_model, tmp_path / "model")
+    tiny.rewrite_group(folder, "reachability", steps=0)
+    with pytest.raises(ValueError, match=r"reachability\.steps is 0"):
+        train_reachability(folder, cache_meta, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+NOWHERE = {"policy": PolicySource("no/such"), "output_dir": "out"}
+NONSENSE = {
+    "--steps is 0": lambda: TrainReachability(**NOWHERE, steps=0),
+    "--steps is -5": lambda: TrainReachability(**NOWHERE, steps=-5),
+    r"--seeds is \[\]": lambda: TrainReachability(**NOWHERE, seeds=[]),
+    r"--seeds is \[1, 1\]": lambda: TrainReachability(**NOWHERE, seeds=[1, 1]),
+    r"--seeds is \[-1\]": lambda: TrainReachability(**NOWHERE, seeds=[-1]),
+    "--seed is -1": lambda: TrainMargin(**NOWHERE, seed=-1),
+    "--image_size is 0": lambda: Cache("out", image_size=0),
+    "--image_size is -1": lambda: Cache("out", image_size=-1, encoder="auto"),
+    "--dtype is 'half'": lambda: Cache("out", dtype="half"),
+}
+
+
+@pytest.mark.parametrize("message", NONSENSE)
+def test_options_that_mean_nothing_are_refused_before_any_work(message):
+    with pytest.raises(ValueError, match=message):
+        NONSENSE[message]()
+
+
+def test_a_seed_of_several_has_its_own_folder_and_each_is_done_once(
+    tiny_world_model, cache_root, tmp_path, monkeypatch
+):
+    from lerobot_latentsafe.cli.options import DatasetSource
+
+    options = (PolicySource(str(tiny_world_model)), tmp_path / "out", DatasetSource(tiny.REPO_ID, str(cache_root)))
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        learn, calls = training._learn_critic, iter([False, True])
+        patch.setattr(training, "_learn_critic", lambda *given: killed() if next(calls) else learn(*given))
+        TrainReachability(*options, seeds=[0, 1], steps=3).run()
+    first = (tmp_path / "out" / "seed_0" / "model.safetensors").stat().st_mtime_ns
+    TrainReachability(*options, seeds=[0, 1], steps=3).run()
+    assert (tmp_path / "out" / "seed_0" / "model.safetensors").stat().st_mtime_ns == first
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["seed_0", "seed_1"]
+    names = ("model.critic.q.0.weight",)
+    weights = [load_file(tmp_path / "out" / f"seed_{n}" / "model.safetensors") for n in (0, 1)]
+    assert not any(torch.equal(weights[0][name], weights[1][name]) for name in names)
+    assert load_filter(tmp_path / "out" / "seed_1").config.trained_on.stage == "critic"
