@@ -126,14 +126,14 @@ class CheckLabels:
         store = LabelStore(frames.root, frames.meta.repo_id, [self.specification])
         judged = dict(episode_margins(model, frames))
         margins = {episode: margin for episode, margin in judged.items() if not isinstance(margin, str)}
+        without = {episode: why for episode, why in judged.items() if isinstance(why, str)}
         found = find_disagreements(store, self.specification, margins)
         for d in found[:20]:
             label = in_words(store.verdict(self.specification, d.episode).first, len(d.margin))
             print(f"episode {d.episode:5d}  {d.degree:.2f}  labelled: {label}")
         write_disagreements(self.output, found, store, frames, self.specification)
-        without = [episode for episode in judged if episode not in margins]
-        for episode in without[:SHOWN]:
-            print(f"episode {episode} was not judged, because {judged[episode]}")
+        for episode, why in [*without.items()][:SHOWN]:
+            print(f"episode {episode} was not judged, because {why}")
         print(f"{len(found)} disagreements; {len(without)} episodes were not judged; open {self.output}")
 
 
