@@ -16,7 +16,6 @@ from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.configs import EnvConfig
-from lerobot.policies.factory import make_pre_post_processors
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.policies.utils import prepare_observation_for_inference
 from lerobot.processor import PolicyProcessorPipeline
@@ -35,6 +34,8 @@ from lerobot_latentsafe.evaluation.along_episodes import values_along as model_v
 from lerobot_latentsafe.evaluation.rollouts import compare
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
 from lerobot_latentsafe.reports.figures import write_videos
+from lerobot_latentsafe.runtime.checkpoint import resolve_checkpoint
+from lerobot_latentsafe.runtime.processors import load_processors
 from lerobot_latentsafe.training import train_reachability
 
 quiet_decoder()  # a notebook has no other place to ask for it
@@ -70,8 +71,8 @@ def shield_policy(
                     f"this {policy.name} policy was loaded from no checkpoint, so its processors are not known; "
                     "give preprocessor= and postprocessor= (LeRobot's make_pre_post_processors makes them)"
                 )
-            path = str(policy.config.pretrained_path)
-            preprocessor, postprocessor = make_pre_post_processors(policy.config, pretrained_path=path)
+            folder = resolve_checkpoint(policy.config.pretrained_path)
+            preprocessor, postprocessor = load_processors(policy.config, folder)
         policy = BasePolicy(policy, preprocessor, postprocessor)
     filter.attach(policy)
     return filter

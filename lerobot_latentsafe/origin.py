@@ -10,8 +10,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from huggingface_hub.utils import HFValidationError, validate_repo_id
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME, HF_LEROBOT_HUB_CACHE, OBS_STATE
+
+from lerobot_latentsafe.runtime.checkpoint import CheckpointError, is_downloaded, read_json
 
 FILE = "trained_on.json"
 """What is known of a policy's origin, in its folder; a person may write it. It counts more than everything else."""
@@ -77,7 +80,7 @@ def _told(file: Path) -> dict[str, Any]:
     if not file.exists():
         return {}
     try:
-        told = json.loads(file.read_text())
+        told = read_json(file)
         names = [name for key in ("action_names", "state_names") for name in told.get(key) or []]
     except (ValueError, AttributeError, TypeError) as e:
         raise ValueError(f"{file} is not readable ({e}); expected action_names, state_names, fps") from e
@@ -89,13 +92,13 @@ def _told(file: Path) -> dict[str, Any]:
 def _of_dataset(folder: Path) -> dict[str, Any]:
     for file in _infos(folder):
         try:
-            info = json.loads(file.read_text())
+            info = read_json(file)
             features = info["features"]
             names = {
                 name: _flat(features.get(key)) for name, key in (("action_names", ACTION), ("state_names", OBS_STATE))
             }
             return {**names, "fps": info.get("fps")}
-        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        except (CheckpointError, KeyError, TypeError, AttributeError):
             continue  # a file that is not one tells nothing
     return {}
 
@@ -103,15 +106,23 @@ def _of_dataset(folder: Path) -> dict[str, Any]:
 def _infos(folder: Path) -> Iterator[Path]:
     """Where the metadata of the dataset of a checkpoint may lie on this machine."""
     try:
-        dataset = json.loads((folder / "train_config.json").read_text())["dataset"]
+        dataset = read_json(folder / "train_config.json")["dataset"]
         repo_id, root = dataset["repo_id"], dataset.get("root")
-    except (OSError, ValueError, KeyError, TypeError):
+    except (CheckpointError, KeyError, TypeError, AttributeError):
         return
-    places = [Path(root)] if root else []
-    if isinstance(repo_id, str):
+    places = [Path(root)] if isinstance(root, str) and not is_downloaded(folder) else []  # else it is another machine's
+    if _is_repo_id(repo_id):
         places.append(HF_LEROBOT_HOME / repo_id)
         places += sorted((HF_LEROBOT_HUB_CACHE / f"datasets--{repo_id.replace('/', '--')}").glob("snapshots/*"))
     yield from (file for place in places if (file := place / "meta" / "info.json").is_file())
+
+
+def _is_repo_id(repo_id: Any) -> bool:
+    try:
+        validate_repo_id(repo_id)
+    except (HFValidationError, TypeError):
+        return False
+    return True
 
 
 def _flat(feature: dict | None) -> list[str] | None:

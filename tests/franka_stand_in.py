@@ -28,6 +28,7 @@ class FakeDriver:
         self.follow, self.joints = follow, HOME.copy()
         self.position, self.rotation, self.width = START.copy(), DOWN, GRIPPER_WIDTH
         self.tracked: list[np.ndarray] = []
+        self.streamed: list[tuple] = []  # (time, pose), with a clock that stands
         self.calls: list[str] = []
         self.started = self.reflex = self.blocked = self.gripper_lost = False
         self.lock = threading.Lock()
@@ -85,6 +86,7 @@ def standing_clock(monkeypatch):
     clock, track = SimpleNamespace(now=0.0, runs=False, monotonic=lambda: clock.now), FakeDriver.track
 
     def timed(self, position, rotation):
+        self.streamed.append((clock.now, (position, rotation)))
         clock.now += clock.runs / STREAM_HZ
         track(self, position, rotation)
 

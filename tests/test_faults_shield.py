@@ -5,7 +5,7 @@ import torch
 from faulty import BENCHES, FRONT, IMAGE, STATE, WRIST, row, stays
 
 from lerobot_latentsafe.decision import Reason
-from lerobot_latentsafe.evaluation.faults import FAULTS, PICTURES, first, shown
+from lerobot_latentsafe.evaluation.faults import EMPTY, FAULTS, PICTURES, first, shown
 from lerobot_latentsafe.guard import UnknownPoseError
 
 
@@ -39,11 +39,14 @@ OF_STATES = [
     stays("S20", "a state that is a list or a word", FAULTS["a state in words"], MALFORMED),
     stays("S11", "no state in an observation", FAULTS["no state"], MISSING),
 ]  # fmt: skip
+CAPS = ("a lens cap", "a lens cap and a noisy sensor")
 OF_PICTURES = [
     stays("S11", "no camera in an observation", FAULTS["no picture"], MISSING),
     stays("S05", "a camera shows one grey, black or white", FAULTS["a dead camera"], MISSING),
     stays("S05", "a camera shows one grey, black or white", FAULTS["a black picture"], MISSING),
     stays("S05", "a camera shows one grey, black or white", FAULTS["a white picture"], MISSING),
+    *(stays("S04", "a lens cap, with 2 or 10 grey levels of noise", shown(EMPTY[name]), MISSING) for name in CAPS),
+    *(stays("S05", "a camera shows one colour", shown(EMPTY[name]), MISSING) for name in EMPTY if name not in CAPS),
     stays("S67", "a pixel is NaN or infinite", FAULTS["a pixel that is no number"], NOT_FINITE),
     stays("S67", "a pixel is NaN or infinite", FAULTS["a picture of infinity"], NOT_FINITE),
     stays("S67", "pixels beyond [0, 1]: 0 to 255, 1e30, below zero", FAULTS["a picture of 1e30"], MALFORMED),

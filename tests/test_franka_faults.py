@@ -3,6 +3,7 @@
 import threading
 from contextlib import suppress
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from lerobot_latentsafe.franka.actions import (
 from lerobot_latentsafe.robots.franka import checked
 from lerobot_latentsafe.robots.franka.driver import ArmFaultError, ArmState, FrankaError, GripperError
 from lerobot_latentsafe.robots.franka.franka import DOWN
-from lerobot_latentsafe.robots.franka.limits import Pose
+from lerobot_latentsafe.robots.franka.limits import KEPT, Pose
 
 
 @pytest.fixture
@@ -168,9 +169,28 @@ def test_an_arm_that_does_not_stop_is_told(robot, caplog):
 @pytest.mark.parametrize("rate", [15, 60, 200])
 def test_the_speed_limit_is_by_time_not_by_action(robot, step, rate):
     sent = [step(robot.config.fps / rate, delta_y=0.02, delta_rz=0.13) for _ in range(rate // 5)]
-    assert sum(action["delta_y.pos"] for action in sent) <= MAX_SPEED * (0.2 + 1 / 15) + 1e-9
-    assert sum(action["delta_rz.pos"] for action in sent) <= MAX_TURN_SPEED * (0.2 + 1 / 15) + 1e-9
+    assert sum(action["delta_y.pos"] for action in sent) <= MAX_SPEED * (0.2 + KEPT / 15) + 1e-9
+    assert sum(action["delta_rz.pos"] for action in sent) <= MAX_TURN_SPEED * (0.2 + KEPT / 15) + 1e-9
     assert sum(action["delta_y.pos"] for action in sent) > 0.8 * MAX_SPEED * 0.2
+
+
+def test_what_is_streamed_is_no_faster_than_the_limit_however_actions_come(robot, clock):
+    clock.runs = True
+    for _ in range(20):
+        for _ in range(3):  # in a burst
+            robot.send_action(STILL | {"delta_y.pos": 0.02, "delta_rz.pos": 0.13})
+        until = clock.now + 1 / robot.config.fps
+        wait_for(lambda until=until: clock.now >= until)
+    times, poses = zip(*robot.driver.streamed)
+    speed = np.abs(np.diff([position[1] for position, _ in poses])) / np.diff(times)
+    turning = [(b * a.inv()).magnitude() for (_, a), (_, b) in pairwise(poses)] / np.diff(times)
+    assert speed.max() <= 1.01 * MAX_SPEED and turning.max() <= 1.01 * MAX_TURN_SPEED
+
+
+def test_a_loop_that_is_not_quite_regular_loses_nothing(robot, step):
+    robot.driver.follow = 1.0
+    late = [1.2, 0.8, 1.0, 0.7, 1.3, 0.9, 1.1] * 3
+    assert [step(periods, delta_y=0.01)["delta_y.pos"] for periods in late] == pytest.approx([0.01] * len(late))
 
 
 @pytest.mark.parametrize("moment", [-1.0, NAN, -np.inf])

@@ -164,12 +164,25 @@ def test_an_error_in_the_middle_of_an_episode_keeps_the_recording(robot, tmp_pat
     assert LeRobotDataset("me/real", root=tmp_path / "real").num_frames == 5
 
 
-def test_broken_actions_move_nothing(robot):
+@pytest.mark.parametrize(
+    ("broken", "message"),
+    [
+        (STILL | {"delta_x.pos": np.nan}, "non-finite"),
+        ({"delta_x": 1.0}, r"expected delta_x\.pos"),
+        ({}, r"has the names \(none\)"),
+        (None, "does not name numbers"),
+        (STILL | {"delta_x.pos": None}, "does not name numbers"),
+        (STILL | {"delta_x.pos": "fast"}, "does not name numbers"),
+        (STILL | {"delta_x.pos": np.zeros(2)}, "does not name numbers"),
+    ],
+    ids=str,
+)
+def test_broken_actions_move_nothing(robot, broken, message):
     before = robot._stream.target()[0].copy()
-    for broken in (STILL | {"delta_x.pos": float("nan")}, {"delta_x": 1.0}):
-        with pytest.raises(ValueError, match=r"non-finite|expected delta_x\.pos"):
-            robot.send_action(broken)
+    with pytest.raises(ValueError, match=message):
+        robot.send_action(broken)
     np.testing.assert_array_equal(robot._stream.target()[0], before)
+    assert robot.send_action(STILL)  # the arm is well
 
 
 def test_an_unconnected_robot_says_so():

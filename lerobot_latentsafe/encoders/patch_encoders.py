@@ -184,11 +184,12 @@ def load_dino(name: str) -> DinoEncoder:
     except ImportError as e:
         raise EncoderError(f"encoder {name} needs transformers: pip install 'lerobot_policy_latentsafe[dino]'") from e
     model_id = DINO.get(name, name)
+    data_alone = {"trust_remote_code": False, "use_safetensors": True}  # a checkpoint may name any encoder
     try:
-        model = AutoModel.from_pretrained(model_id, local_files_only=True)
+        model = AutoModel.from_pretrained(model_id, local_files_only=True, **data_alone)
     except (OSError, ValueError):
         try:
-            model = AutoModel.from_pretrained(model_id)
+            model = AutoModel.from_pretrained(model_id, **data_alone)
         except Exception as e:
             raise EncoderError(
                 f"encoder {model_id} is neither in the cache nor to be had from the Hub ({type(e).__name__}: {e})"

@@ -61,9 +61,12 @@ def read_action(action: Mapping[str, float], fps: int) -> Command:
     positions and no delta is such a joint move.
 
     Raises:
-        ValueError: other names, or a value that is not finite.
+        ValueError: other names, or a value that is no finite number.
     """
-    values = {name: float(value) for name, value in action.items()}
+    try:
+        values = {name: float(value) for name, value in action.items()}
+    except (AttributeError, TypeError, ValueError) as e:
+        raise ValueError(f"action {action!r:.200} does not name numbers ({e}); nothing was sent to the robot") from e
     broken = [name for name, value in values.items() if not np.isfinite(value)]
     if broken:
         raise ValueError(f"action has non-finite values for {', '.join(broken)}; nothing was sent to the robot")

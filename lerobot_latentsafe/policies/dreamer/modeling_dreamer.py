@@ -15,7 +15,15 @@ from lerobot_latentsafe.model_card import make_task_policy_card
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
 from lerobot_latentsafe.policies.dreamer.behavior import Actor, ReturnRange, TwoHotHead, imagine, lambda_returns
 from lerobot_latentsafe.policies.dreamer.configuration_dreamer import LatentSafeDreamerConfig
-from lerobot_latentsafe.runtime.checkpoint import CheckpointError, fitting_weights, read_config, resolve_checkpoint
+from lerobot_latentsafe.runtime.checkpoint import (
+    CONFIG,
+    CheckpointError,
+    fitting_weights,
+    named_by,
+    read_config,
+    read_json,
+    resolve_checkpoint,
+)
 from lerobot_latentsafe.runtime.hub import save_policy
 from lerobot_latentsafe.safety_model import SafetyModel, UntrainedFilterError
 
@@ -182,7 +190,7 @@ class LatentSafeDreamerPolicy(PreTrainedPolicy):
         config = config or read_config(folder)
         if not isinstance(config, LatentSafeDreamerConfig):
             raise CheckpointError(f"{pretrained_name_or_path} is a {config.type!r} policy, expected latentsafe_dreamer")
-        config.world_model_path = stored_world_model(folder, config)
+        config.world_model_path = _found_world_model(folder, config.world_model_path)
         with fitting_weights(folder):
             return super().from_pretrained(folder, config=config, strict=True, **kwargs)
 
@@ -197,6 +205,13 @@ def stored_world_model(folder: Path, config: LatentSafeDreamerConfig) -> str | N
     """Path of the world model of a policy stored in a folder: beside it, or that of a checkpoint which it shares."""
     path = config.world_model_path
     return str(folder / path) if path == WORLD_MODEL_FOLDER else path
+
+
+def _found_world_model(folder: Path, path: str | None) -> str | None:
+    """Where it is on this machine: a user may choose any, a folder's own configuration names what it may name."""
+    if path is None or path != read_json(folder / CONFIG).get("world_model_path"):
+        return path
+    return str(named_by(folder, path, f"Put it into {folder / WORLD_MODEL_FOLDER}, or give --policy.world_model_path"))
 
 
 def _load_world_model(config: LatentSafeDreamerConfig) -> SafetyModel:

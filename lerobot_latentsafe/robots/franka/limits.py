@@ -5,9 +5,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lerobot_latentsafe.franka.actions import action_limits
+from lerobot_latentsafe.franka.actions import MAX_SPEED, MAX_TURN_SPEED, action_limits
 from lerobot_latentsafe.robots.franka.config_franka import LatentSafeFrankaConfig
 from lerobot_latentsafe.robots.franka.driver import ArmState
+
+KEPT = 1.5
+"""Control steps."""
 
 
 class Pose(NamedTuple):
@@ -17,16 +20,22 @@ class Pose(NamedTuple):
     rotation: Rotation
 
 
+def shortest_time(start: Pose, end: Pose) -> float:
+    """How long a motion takes at the speed limit of each axis, s."""
+    turn = (end.rotation * start.rotation.inv()).as_rotvec()
+    return float(max(np.abs(end.position - start.position).max() / MAX_SPEED, np.abs(turn).max() / MAX_TURN_SPEED))
+
+
 class Limits:
     """Bounds each motion of the commanded pose.
 
-    However often actions come, no more of the speed limit is spent than time has passed, and what was not used within
-    a control step is gone.
+    However often actions come, no more of the speed limit is spent than time has passed. What was not used is kept for
+    KEPT control steps, so that a loop that is not quite regular loses nothing.
     """
 
     def __init__(self, config: LatentSafeFrankaConfig):
         self.config = config
-        self._left, self._since = 1.0, -np.inf
+        self._left, self._since = KEPT, -np.inf
 
     def allowed(self, commanded: Pose, delta: np.ndarray, state: ArmState, now: float) -> Pose:
         """Where a motion (6,) in m and rad leads from the commanded pose, at a time in s."""
@@ -54,9 +63,10 @@ class Limits:
     def _in_pace(self, step: np.ndarray, now: float) -> np.ndarray:
         """As much of a motion (6,) as the time since the last ones allows on each axis."""
         passed = (now - self._since) * self.config.fps
-        self._left = min(1.0, self._left + passed) if passed > 0 else self._left  # no clock that goes back gives time
+        self._left = min(KEPT, self._left + passed) if passed > 0 else self._left  # no clock that goes back gives time
         self._since = now
         reach = action_limits(self.config.fps)[1][:6]
-        taken = np.clip(step, -self._left * reach, self._left * reach)
+        share = min(1.0, self._left)
+        taken = np.clip(step, -share * reach, share * reach)
         self._left = max(0.0, self._left - np.abs(taken / reach).max())
         return taken

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from lerobot_latentsafe.robots.franka.checked import CheckedDriver
 from lerobot_latentsafe.robots.franka.driver import ArmFaultError, FrankaError, GripperError
-from lerobot_latentsafe.robots.franka.limits import Pose
+from lerobot_latentsafe.robots.franka.limits import Pose, shortest_time
 
 logger = logging.getLogger(__name__)
 
@@ -36,6 +36,7 @@ class Stream(threading.Thread):
         self.error: Exception | None = None
         self._lock, self._stopping = threading.Lock(), threading.Event()
         self._from = self._to = pose
+        self._lasts = period
         self._since = self._sent = time.monotonic()
         self._holds = True
 
@@ -58,13 +59,14 @@ class Stream(threading.Thread):
             return self._to
 
     def set_target(self, pose: Pose) -> None:
-        """Reach a pose within one control step from now."""
+        """Reach a pose within one control step from now, or later where that were faster than the speed limit."""
         with self._lock:
             self._from, self._to = self._now(), pose
+            self._lasts = max(self.period, shortest_time(self._from, pose))
             self._since, self._holds = time.monotonic(), False
 
     def _now(self) -> Pose:
-        share = np.clip((time.monotonic() - self._since) / self.period, 0, 1)
+        share = np.clip((time.monotonic() - self._since) / self._lasts, 0, 1)
         (p0, r0), (p1, r1) = self._from, self._to
         return Pose(p0 + share * (p1 - p0), Slerp([0, 1], Rotation.concatenate([r0, r1]))(share))
 
