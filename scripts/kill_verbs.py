@@ -16,6 +16,8 @@ import argparse
 import tempfile
 from pathlib import Path
 
+from lerobot_latentsafe.cli import evaluate, label, record, train  # noqa: F401  (before any fork)
+from lerobot_latentsafe.cli import main as latentsafe
 from lerobot_latentsafe.evaluation.statistics import provenance, write_json
 from lerobot_latentsafe.experiments.kills import VERBS, kill_verbs
 
@@ -29,7 +31,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=Path("results/reliability/kills.json"))
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        rows = kill_verbs(arguments.work or Path(folder), arguments.verbs, arguments.n, arguments.seed)
+        rows = kill_verbs(arguments.work or Path(folder), arguments.verbs, arguments.n, arguments.seed, latentsafe)
     write_json(arguments.output, {"verbs": rows, **provenance(seeds=[arguments.seed])})
 
 

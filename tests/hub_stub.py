@@ -12,12 +12,16 @@ NO_COMMIT = "0" * 40
 
 
 class Hub:
-    """`repos`: id -> file name -> content; `commits`: id -> hashes. Serves on 127.0.0.1 between `with`."""
+    """`repos`: id -> file name -> content; `commits`: id -> hashes. Serves on 127.0.0.1 between `with`.
+
+    `fault` is what becomes of weights that are uploaded: "500", "cut", or None.
+    """
 
     def __init__(self):
         self.repos: dict[str, dict[str, bytes]] = {}
         self.commits: dict[str, list[str]] = {}
         self.uploads: dict[str, bytes] = {}
+        self.fault: str | None = None
         self.server = ThreadingHTTPServer(("127.0.0.1", 0), type("Handler", (_Handler,), {"hub": self}))
         self.url = f"http://127.0.0.1:{self.server.server_port}"
 
@@ -98,6 +102,11 @@ class _Handler(BaseHTTPRequestHandler):
         self._send({"transfer": "basic", "objects": objects}, headers=kind)
 
     def lfs_upload(self, body, oid):
+        if self.hub.fault == "cut":
+            self.close_connection = True
+            return self.connection.close()
+        if self.hub.fault:
+            return self._send({"error": "broken"}, int(self.hub.fault))
         self.hub.uploads[oid] = body
         self._send({})
 

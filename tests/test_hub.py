@@ -1,3 +1,5 @@
+import json
+
 import huggingface_hub.utils
 import pytest
 import tiny
@@ -180,6 +182,21 @@ def test_push_that_breaks_off_is_a_clear_error(hub, policy, monkeypatch):
         push_policy(policy, "me/filter", "me/car")
 
 
+@pytest.mark.parametrize("fault", ["500", "403", "cut"])
+def test_weights_that_do_not_arrive_are_pushed_by_the_same_command(hub, tiny_filter, monkeypatch, fault):
+    from lerobot_latentsafe.cli import main
+
+    monkeypatch.setattr("huggingface_hub.utils._http.time.sleep", lambda seconds: None)  # before it tries again
+    before, push = contents(tiny_filter), ["push", f"--policy.path={tiny_filter}", "--repo_id=me/filter"]
+    hub.fault = fault
+    with pytest.raises(SystemExit, match=r"latentsafe push: upload to me/filter broke off.*push again"):
+        main(push)
+    assert contents(tiny_filter) == before and "config.json" not in hub.repos["me/filter"]
+    hub.fault = None
+    main(push)
+    assert LatentSafePolicy.from_pretrained("me/filter").config.trained_on.stage == "critic"
+
+
 def test_unreachable_hub_is_a_clear_error_when_pulling(no_hub):
     with pytest.raises(CheckpointError, match=r"(?s)could not get me/filter.*connection"):
         LatentSafePolicy.from_pretrained("me/filter")
@@ -257,15 +274,63 @@ def test_card_names_the_encoder_and_what_was_measured(hub, seeing, tmp_path):
     assert LatentSafePolicy.from_pretrained("me/bag").config.evaluation["policies: weak, bare, spilled"]
 
 
+def rate(**changes):
+    return json.dumps({"weak": {"spilled": {"k": 3, "n": 10, "low": 0.1, "high": 0.6, **changes}}})
+
+
 @pytest.mark.parametrize(
-    ("content", "words"), [("{", "not a readable"), ('{"commit": "abc"}', "holds none of spilled")]
-)
+    ("content", "words"),
+    [
+        ("{", "not a readable"), ('{"commit": "abc"}', "holds none of spilled"), ("[1]", "expected an object"),
+        ("[" * 100_000, "not a readable"), (rate(k=11), "is no rate"), (rate(k=-1), "is no rate"),
+        (rate(k=1.5), "is no rate"), (rate(k="3"), "is no rate"), (rate(n=True, k=0), "is no rate"),
+        (rate(n=float("nan")), "is no rate"), (rate(low=float("nan")), "is no rate"), (rate(low=0.9), "is no rate"),
+        (rate(high="1"), "is no rate"), (rate(n=None), "is no rate"),
+        (json.dumps({"a": {"overridden_share": 2, **json.loads(rate())["weak"]}}), "expected a share"),
+    ],
+)  # fmt: skip
 def test_results_without_rates_are_refused(tmp_path, content, words):
     from lerobot_latentsafe.model_card import measured
 
     (tmp_path / "results.json").write_text(content)
     with pytest.raises(ValueError, match=words):
         measured(tmp_path / "results.json", "reachability")
+
+
+def test_a_result_of_no_rollouts_says_so(tmp_path):
+    from lerobot_latentsafe.model_card import measured
+
+    (tmp_path / "results.json").write_text(rate(k=0, n=0))
+    assert measured(tmp_path / "results.json", "reachability")["results: weak, spilled"] == "0/0, not measured"
+
+
+HOSTILE = [
+    "<script>window.__pwned = 1</script>", "<img src=x onerror=alert(1)>", "[click](javascript:alert(1))",
+    "![x](http://evil.example/x.png)", "a\n# Pwned", "a\n---\nlicense: evil\n---\n# Pwned", "` | **x** | `",
+    "a\x1b[2J\0b",
+    "a\r\n\r\n```\n<script>window.__pwned = 1</script>",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_names_are_text_in_a_card(policy, name):
+    """Rendered with HTML kept, as some viewers do, where the Hub would take it out."""
+    from markdown_it import MarkdownIt
+
+    from lerobot_latentsafe.model_card import make_task_policy_card
+
+    config = policy.config
+    config.trained_on.robot_type, config.trained_on.state_names = name, [name, "y"]
+    config.margin.failure_specification = config.base_policy_path = config.repo_id = name
+    config.evaluation = {name: name}
+    config.calibration = {"missed": float("nan"), "failing_episodes": 3.0}
+    filter_card = policy.generate_model_card(name, "latentsafe", name, [name])
+    for card in (filter_card, make_task_policy_card(name, name, name, name, [name])):
+        page = MarkdownIt("commonmark", {"html": True}).enable("table").render(card.text)
+        for tag in ("<script", "<img", 'href="javascript:', "Pwned</h1>", "<strong>x"):
+            assert tag not in page, card.text
+        assert card.data.tags is not None and "\n" not in card.data.license and card.data.license != "evil"
+    assert "evidence is not whole" in filter_card.text
 
 
 @pytest.mark.parametrize("shielded", [False, True])

@@ -1,5 +1,6 @@
 """The page's server: what it answers, what it refuses, and that nothing sent to it goes anywhere."""
 
+import asyncio
 import itertools
 import random
 import shutil
@@ -141,7 +142,11 @@ def test_wrong_token_is_refused(client, token):
     assert client.post(f"/{token}/api/undo/spilled", headers=POST, json={"tab": "t"}).status_code in (403, 404)
 
 
-@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example", "", "[::1", "169.254.0.1:8765"])
+@pytest.mark.parametrize(
+    "host",
+    ["evil.example", "127.0.0.1.evil.example", "", "[::1", "169.254.0.1:8765", "127.0.0.1:x", "127.0.0.1:8765/x",
+     "a@127.0.0.1", "127.0.0.1#", "[127.0.0.1]x", "::1", "]", "127.0.0.1 evil", "127.0.0.1:123456"],
+)  # fmt: skip
 def test_other_names_of_this_machine_are_refused(client, host):
     """A name that resolves to 127.0.0.1 must not give a foreign page access (DNS rebinding)."""
     assert ask(client, "api/dataset", headers={"host": host}).status_code in (400, 403)
@@ -226,10 +231,64 @@ def test_port_in_use_is_a_message():
             listen("127.0.0.1", taken.getsockname()[1])
 
 
-@pytest.mark.parametrize("host", ["0.0.0.0", "::", ""])
+@pytest.mark.parametrize(
+    "host",
+    ["0.0.0.0", "::", "", "0", "0x0", "00", "0.0", "000.0.0.0", "0x0.0.0.0", "::0", "0:0:0:0:0:0:0:0",
+     "::ffff:0.0.0.0", "::ffff:0:0", "224.0.0.1"],
+)  # fmt: skip
 def test_every_interface_at_once_is_refused(host):
     with pytest.raises(ValueError, match="SSH tunnel"):
         listen(host, 0)
+
+
+LOOPBACK = ["127.0.0.1", "127.1", "0x7f.1", "2130706433", "::ffff:127.0.0.1", "::ffff:7f00:1"]
+
+
+@pytest.mark.parametrize("host", LOOPBACK)
+def test_loopback_is_loopback_however_it_is_spelled(host):
+    with listen(host, 0) as listener:
+        assert listener.getsockname()[0] == "127.0.0.1"
+
+
+def test_an_address_beyond_loopback_is_spelled_out(monkeypatch):
+    def resolved(host, *_, **__):
+        return [(socket.AF_INET, socket.SOCK_STREAM, 6, "", ("192.0.2.7", 0))]
+
+    monkeypatch.setattr(socket, "getaddrinfo", resolved)
+    for host in ("somewhere.example", "0xc0.0.2.7", "192.0.519"):
+        with pytest.raises(ValueError, match=r"stands for 192\.0\.2\.7, which others can reach.*--host=192\.0\.2\.7"):
+            listen(host, 0)
+    assert str(app_module.address_of("192.0.2.7")) == "192.0.2.7"
+
+
+@pytest.mark.parametrize("host", ["not.a.host.invalid", "a" * 300, "a\0b", "*", "127.0.0.1:80"])
+def test_a_host_that_is_none_is_a_message(host, monkeypatch):
+    with pytest.raises(OSError, match="cannot listen on"):
+        listen(host, 0)
+
+
+@pytest.mark.parametrize("port", [-1, 70000, 2**40])
+def test_a_port_that_is_none_is_a_message(port):
+    with pytest.raises(OSError, match="choose another --port"):
+        listen("127.0.0.1", port)
+
+
+@pytest.mark.parametrize("path", ["*", "", "/", "//", "http://evil.example/", "evil.example:443"])
+@pytest.mark.parametrize("headers", [[], [(b"host", b"127.0.0.1")], [(b"host", b"\xff[")], [(b"origin", b"http://[")]])
+@pytest.mark.parametrize("method", ["OPTIONS", "GET", "CONNECT"])
+def test_odd_requests_are_refused_without_a_trace(server, method, path, headers):
+    """Such as `OPTIONS *`, which no test client can send."""
+    scope = {
+        "type": "http", "method": method, "path": path, "raw_path": path.encode(), "headers": headers,
+        "query_string": b"", "scheme": "http", "server": ("127.0.0.1", 8765), "root_path": "", "http_version": "1.1",
+    }  # fmt: skip
+    sent = []
+
+    async def send(message):
+        sent.append(message)
+
+    asyncio.run(server.app(TOKEN, {"127.0.0.1"})(scope, None, send))
+    assert sent[0]["status"] == 403
 
 
 def test_dataset_without_cameras_is_a_message(cache_meta):

@@ -1,4 +1,6 @@
 import json
+import random
+from contextlib import suppress
 from datetime import UTC, datetime
 
 import pyarrow as pa
@@ -237,6 +239,21 @@ def test_a_broken_label_file_says_what_is_wrong_and_stays(tmp_path, changes, mes
             use()
         assert str(path) in str(refused.value)
     assert path.read_bytes() == kept
+
+
+def test_no_byte_that_changed_changes_a_label(tmp_path):
+    """As a bad disk does: the file is refused, says what it said, or is no longer known to be of an episode."""
+    path, rng = sidecar(tmp_path), random.Random(0)
+    content = Content(tmp_path)
+    Sidecar.read(path, content).write(path, "me/car", content)
+    whole = path.read_bytes()
+    for _ in range(300):
+        broken = bytearray(whole)
+        broken[rng.randrange(len(broken))] ^= 1 << rng.randrange(8)
+        path.write_bytes(broken[: rng.choice([len(broken), rng.randrange(len(broken))])])
+        with suppress(LabelFileError):
+            read = Sidecar.read(path, content).failure.tolist()
+            assert all(label in (said, UNLABELLED) for label, said in zip(read, [0, 1] * 3, strict=True))
 
 
 def test_a_column_twice_is_refused(tmp_path):

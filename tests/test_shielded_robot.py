@@ -1,12 +1,9 @@
 """Any robot behind a filter: what is sent is judged, and nothing unjudged moves it."""
 
-import importlib.util
 import logging
 import sys
 import threading
-import types
 from dataclasses import dataclass
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,24 +16,15 @@ from lerobot.processor import RobotActionProcessorStep, RobotProcessorPipeline, 
 from lerobot.processor.converters import robot_action_observation_to_transition, transition_to_robot_action
 from lerobot.robots.utils import make_robot_from_config
 from lerobot.scripts import lerobot_record
+from shielded_robots import ALWAYS, NEVER, PERIOD, PUSH, STILL, config, last
 
 from lerobot_latentsafe import cli
-from lerobot_latentsafe._compat import BETWEEN, RECORDING
 from lerobot_latentsafe.cli import record as recording_verbs
-from lerobot_latentsafe.decision import LawOptions, Reason
+from lerobot_latentsafe.decision import Reason
 from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES
-from lerobot_latentsafe.guard import UnknownPoseError
-from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
 from lerobot_latentsafe.robots.shielded.config_shielded import LatentSafeShieldedConfig
-from lerobot_latentsafe.robots.shielded.shielded import MAX_FAILURES
 
 pytestmark = pytest.mark.usefixtures("virtual_time")
-STILL = dict.fromkeys(ACTION_NAMES, 0.0) | {"gripper.pos": 1.0}
-PUSH = STILL | {"delta_x.pos": 0.015}
-ALWAYS, NEVER = 2.0, -2.0
-"""Thresholds at which a filter always, and never, intervenes."""
-PERIOD = 0.05
-"""Of the filter's data, seconds."""
 
 
 @pytest.fixture(scope="module")
@@ -44,22 +32,11 @@ def trained(tmp_path_factory):
     return tiny.save_franka_filter(tmp_path_factory.mktemp("filter") / "filter")
 
 
-def config(trained, law=None, **changes):
-    """A shielded simulation; `law` are options of its law."""
-    inner = LatentSafeFrankaMujocoConfig(scene="blocks", image_size=32, seed=3)
-    options = {"inner": inner, "filter": str(trained), "law": LawOptions(**{"epsilon": NEVER, **(law or {})})}
-    return LatentSafeShieldedConfig(**{**options, **changes})
-
-
 @pytest.fixture
 def robot(trained):
     made = make_robot_from_config(config(trained))
     with made:
         yield made
-
-
-def last(robot):
-    return robot.filter.shield.decision
 
 
 def test_it_is_the_inner_robot_to_lerobot(robot):
@@ -103,33 +80,7 @@ def test_without_a_fresh_observation_it_looks_itself(robot, virtual_time):
     assert any((first[key] != robot.filter.shield.latent[key]).any() for key in first)
 
 
-def test_an_action_decided_on_an_old_observation_is_not_trusted(robot, virtual_time):
-    robot.get_observation()
-    virtual_time.sleep(robot.slack_s + 2 * PERIOD)
-    robot.send_action(PUSH)
-    assert last(robot).reason.item() == Reason.OBSERVATION_STALE and last(robot).intervened.item()
-
-
-@pytest.mark.parametrize(
-    ("slack_s", "took_s", "stale"),
-    [(0.0, 0.2, True), (0.0, 0.5, True), (0.0, 2.0, True), (0.0, 0.04, False), (0.5, 0.5, False)],
-)
-def test_the_age_counts_from_before_the_robot_was_read(trained, virtual_time, monkeypatch, slack_s, took_s, stale):
-    with make_robot_from_config(config(trained, slack_s=slack_s)) as robot:
-        read = robot.inner.get_observation
-        monkeypatch.setattr(robot.inner, "get_observation", lambda: (read(), virtual_time.sleep(took_s))[0])
-        robot.send_action(PUSH)
-        assert (last(robot).reason.item() == Reason.OBSERVATION_STALE) == stale
-
-
-@pytest.mark.parametrize("slack_s", [-1, float("nan"), float("inf")])
-def test_a_slack_that_is_none_is_refused(trained, slack_s):
-    with pytest.raises(ValueError, match="expected seconds, 0 or more"):
-        config(trained, slack_s=slack_s)
-
-
 def test_a_camera_that_repeats_itself_while_the_robot_moves_is_stale(robot, virtual_time, monkeypatch):
-    robot.send_action(STILL)
     frozen, reasons = robot.get_observation(), []
     read = robot.inner.get_observation
     monkeypatch.setattr(robot.inner, "get_observation", lambda: {**read(), "wrist": frozen["wrist"].copy()})
@@ -147,180 +98,6 @@ def test_a_robot_that_stands_still_may_see_the_same_picture(robot, virtual_time)
         robot.get_observation()
         robot.send_action(STILL)
         assert last(robot).reason.item() == Reason.PASSED
-
-
-PICTURE = np.random.default_rng(0).integers(0, 255, (32, 32, 3), np.uint8)
-MALFORMED, MISSING = Reason.OBSERVATION_MALFORMED, Reason.OBSERVATION_MISSING
-SEEN = {
-    "black": ({"wrist": np.zeros((32, 32, 3), np.uint8)}, MISSING),
-    "NaN": ({"joint_1.pos": float("nan")}, Reason.OBSERVATION_NOT_FINITE),
-    "no camera": ({"wrist": ...}, MISSING),
-    "no picture": ({"wrist": None}, MISSING),
-    "no joint": ({"joint_1.pos": ...}, Reason.OBSERVATION_NOT_FINITE),
-    "no reading": ({"joint_1.pos": None}, Reason.OBSERVATION_NOT_FINITE),
-    "a reading in words": ({"joint_1.pos": "0.3"}, Reason.OBSERVATION_NOT_FINITE),
-    "two readings": ({"joint_1.pos": np.zeros(2)}, Reason.OBSERVATION_NOT_FINITE),
-    "no state": (dict.fromkeys(STATE_NAMES, ...), Reason.OBSERVATION_NOT_FINITE),
-    "another size": ({"wrist": np.zeros((24, 32, 3), np.uint8)}, MALFORMED),
-    "a thumbnail": ({"wrist": PICTURE[:4, :4]}, MALFORMED),
-    "grey": ({"wrist": PICTURE[:, :, 0]}, MALFORMED),
-    "transparent": ({"wrist": PICTURE[:, :, [0, 1, 2, 0]]}, MALFORMED),
-    "channels first": ({"wrist": PICTURE.transpose(2, 0, 1)}, MALFORMED),
-    "floats": ({"wrist": PICTURE / np.float32(255)}, MALFORMED),
-    "16 bits": ({"wrist": PICTURE.astype(np.uint16)}, MALFORMED),
-    "words": ({"wrist": "frame.png"}, MALFORMED),
-    "objects": ({"wrist": np.full((32, 32, 3), None)}, MALFORMED),
-}
-"""What is wrong with an observation (... leaves it out), and why the robot then stays."""
-
-
-def altered(seen, change):
-    return {name: value for name, value in {**seen, **change}.items() if value is not ...}
-
-
-@pytest.mark.parametrize("fault", SEEN)
-@pytest.mark.parametrize("first", [True, False])
-def test_what_cannot_be_seen_is_never_safe(robot, monkeypatch, virtual_time, fault, first):
-    """Also in the first tick of an episode, of which nobody knows anything yet. LeRobot gets what was there last."""
-    change, reason = SEEN[fault]
-    if not first:
-        seen = robot.get_observation()
-        robot.send_action(PUSH)
-        virtual_time.sleep(PERIOD)
-    read = robot.inner.get_observation
-    with monkeypatch.context() as m:
-        m.setattr(robot.inner, "get_observation", lambda: altered(read(), change))
-        shown = robot.get_observation()
-        assert first or fault == "black" or all(np.array_equal(shown[name], seen[name]) for name in change)
-        sent = robot.send_action(PUSH)
-    if fault == "no state" and first:  # nobody knows how wide the fingers are
-        sent["gripper.pos"] = STILL["gripper.pos"]
-    assert sent == pytest.approx(STILL)
-    if last(robot) is not None:
-        assert last(robot).reason.item() == reason and last(robot).intervened.item()
-    for _ in range(2):
-        virtual_time.sleep(PERIOD)
-        sent = robot.send_action(PUSH)
-    assert sent == pytest.approx(PUSH)
-
-
-@pytest.mark.parametrize("broken", [None, 3, "words"])
-def test_an_observation_that_is_none_counts_as_not_read(robot, monkeypatch, virtual_time, broken):
-    robot.send_action(PUSH)
-    virtual_time.sleep(PERIOD)
-    monkeypatch.setattr(robot.inner, "get_observation", lambda: broken)
-    assert robot.send_action(PUSH) == pytest.approx(STILL) and last(robot).reason.item() == Reason.OBSERVATION_STALE
-
-
-def without(*names):
-    return {name: value for name, value in PUSH.items() if name not in names}
-
-
-NOT_FINITE, OUT_OF_RANGE = Reason.ACTION_NOT_FINITE, Reason.ACTION_OUT_OF_RANGE
-ACTIONS = {
-    "None": (PUSH | {"delta_x.pos": None}, NOT_FINITE),
-    "a string": (PUSH | {"delta_x.pos": "0.015"}, NOT_FINITE),
-    "NaN": (PUSH | {"delta_x.pos": float("nan")}, NOT_FINITE),
-    "infinite": (PUSH | {"delta_x.pos": float("-inf")}, NOT_FINITE),
-    "beyond floats": (PUSH | {"delta_x.pos": 10**400}, NOT_FINITE),
-    "beyond single floats": (PUSH | {"delta_x.pos": 1e300}, NOT_FINITE),
-    "two numbers": (PUSH | {"delta_x.pos": np.zeros(2)}, NOT_FINITE),
-    "1e9": (PUSH | {"delta_x.pos": 1e9}, OUT_OF_RANGE),
-    "without a name": (without("delta_x.pos"), NOT_FINITE),
-    "with one name": ({"gripper.pos": 1.0}, NOT_FINITE),
-    "empty": ({}, None),
-    "None at all": (None, None),
-    "a list": ([0.0] * 7, None),
-    "of other names": ({"joint_1.pos": 0.3}, None),
-    "of some other names": (without("delta_x.pos") | {"joint_1.pos": 0.3}, None),
-}
-"""An action, and why the robot then stays; None: there is nothing to judge."""
-
-
-@pytest.mark.parametrize("fault", ACTIONS)
-def test_an_action_that_is_none_of_this_robot_holds_it_still_and_is_told_once(
-    robot, caplog, virtual_time, monkeypatch, fault
-):
-    action, reason = ACTIONS[fault]
-    told, send = [], robot.inner.send_action
-    monkeypatch.setattr(robot.inner, "send_action", lambda action: told.append(action) or send(action))
-    for _ in range(3):
-        robot.get_observation()
-        assert robot.send_action(action) == pytest.approx(STILL)
-        virtual_time.sleep(PERIOD)
-    assert told == [pytest.approx(STILL)] * 3
-    if reason is None:
-        assert last(robot) is None and caplog.text.count("the robot holds still") == 1
-    else:
-        assert last(robot).reason.item() == reason
-    assert robot.send_action(PUSH) == pytest.approx(PUSH)
-
-
-@pytest.mark.parametrize(
-    "kind",
-    [float, np.float32, np.float64, np.array, torch.tensor, lambda x: torch.tensor([x]), lambda x: np.array([x])],
-)
-def test_numbers_of_every_kind_are_judged(robot, kind):
-    assert robot.send_action({name: kind(value) for name, value in PUSH.items()}) == pytest.approx(PUSH)
-
-
-@pytest.mark.parametrize("unfiltered", [False, True])
-def test_what_the_filter_does_not_know_never_reaches_the_robot_unless_allowed(
-    trained, caplog, monkeypatch, virtual_time, unfiltered
-):
-    with make_robot_from_config(config(trained, unfiltered_moves=unfiltered)) as robot:
-        told = []
-        monkeypatch.setattr(robot.inner, "send_action", lambda action: told.append(action) or action)
-        for more in (0.5, float("nan"), None):
-            robot.send_action(PUSH | {"hand.pos": more})
-            virtual_time.sleep(PERIOD)
-        allowed = PUSH | ({"hand.pos": 0.5} if unfiltered else {})
-        assert told == [pytest.approx(allowed), pytest.approx(PUSH), pytest.approx(PUSH)]
-        assert caplog.text.count("knows nothing of hand.pos") == 1
-
-
-@pytest.mark.parametrize("fault", [*ACTIONS, "too many"])
-def test_a_monitor_changes_no_action(trained, monkeypatch, virtual_time, fault):
-    action = PUSH | {"hand.pos": 0.5} if fault == "too many" else ACTIONS[fault][0]
-    with make_robot_from_config(config(trained, {"epsilon": ALWAYS, "mode": "monitor"})) as robot:
-        told = []
-        monkeypatch.setattr(robot.inner, "send_action", lambda action: told.append(action) or action)
-        for _ in range(2):
-            assert robot.send_action(action) is action
-            virtual_time.sleep(PERIOD)
-        assert told == [action] * 2
-        assert last(robot) is None or last(robot).unsafe.item()
-
-
-@pytest.mark.parametrize("fault", SEEN)
-def test_a_monitor_acts_on_no_fault_either(trained, monkeypatch, fault):
-    with make_robot_from_config(config(trained, {"mode": "monitor"})) as robot:
-        read = robot.inner.get_observation
-        monkeypatch.setattr(robot.inner, "get_observation", lambda: altered(read(), SEEN[fault][0]))
-        assert robot.send_action(PUSH) == pytest.approx(PUSH)
-
-
-def test_an_action_that_is_not_finite_never_reaches_the_robot(robot):
-    sent = robot.send_action(PUSH | {"delta_y.pos": float("nan")})
-    assert last(robot).reason.item() == Reason.ACTION_NOT_FINITE and np.isfinite(list(sent.values())).all()
-
-
-@pytest.mark.parametrize("told", [None, 0.25])
-def test_a_grip_that_cannot_be_read_is_kept_as_it_was_told_and_else_nothing_is_sent(
-    robot, monkeypatch, virtual_time, told
-):
-    if told is not None:
-        robot.send_action(PUSH | {"gripper.pos": told})
-        virtual_time.sleep(PERIOD)
-    read, sent = robot.inner.get_observation, []
-    monkeypatch.setattr(robot.inner, "get_observation", lambda: read() | {"gripper.pos": float("nan")})
-    monkeypatch.setattr(robot.inner, "send_action", lambda action: sent.append(action) or action)
-    if told is None:
-        with pytest.raises(UnknownPoseError, match=r"no usable reading of gripper\.pos, and was told nothing yet"):
-            robot.send_action({"joint_1.pos": 0.3})
-        assert not sent
-    else:
-        assert robot.send_action({"joint_1.pos": 0.3}) == pytest.approx(STILL | {"gripper.pos": told})
 
 
 def test_joint_moves_are_held_back_unless_allowed(trained, caplog):
@@ -354,200 +131,6 @@ def test_what_stays_closed_stays_closed_through_moves_of_other_names(robot):
     for _ in range(3):
         sent = robot.send_action(joints)
         assert sent == pytest.approx(STILL | {"gripper.pos": 0.25})
-
-
-def looping(where, call, **variables):
-    """Let something be called by a loop of this name and with these variables, as by LeRobot's."""
-    module, function = where
-    space = {"__name__": module}
-    exec(f"def {function}(call, {', '.join(variables)}):\n    return call()", space)
-    return space[function](call, **variables)
-
-
-class Recorded:
-    """A dataset that is being recorded, as far as loops tell."""
-
-    def __init__(self, episode):
-        self.num_episodes = episode
-
-
-RECORD_LOOP, POLICY_LOOP = RECORDING
-RESETS = {
-    "reset of lerobot-record": (RECORD_LOOP, {"dataset": None, "start_episode_t": 5.0}),
-    **{name: ((module, name), {}) for module, name in sorted(BETWEEN)},
-}
-
-
-@pytest.mark.parametrize("where", RECORDING)
-def test_lerobots_loops_are_called_and_name_what_they_record_as_before(where):
-    """A new LeRobot that fails here is to be read anew: which of its loops records what?"""
-    module, function = where
-    found = compiled(module, function)
-    assert set(RECORDING[where]) <= {*found.co_varnames} and {"get_observation"} <= {*found.co_names}
-
-
-@pytest.mark.parametrize("where", sorted(BETWEEN))
-def test_lerobots_moves_between_episodes_are_called_as_before(where):
-    assert {"get_observation"} <= {*compiled(*where).co_names}
-
-
-def compiled(module, function):
-    """The code of a function of a module's file, or of a method in it."""
-    spec = importlib.util.find_spec(module)
-    waiting = [compile(Path(spec.origin).read_text(), spec.origin, "exec")]
-    while waiting:
-        code = waiting.pop()
-        if code.co_name == function:
-            return code
-        waiting += [inner for inner in code.co_consts if isinstance(inner, types.CodeType)]
-    raise AssertionError(f"{module} has no {function}")
-
-
-@pytest.mark.parametrize("reset", RESETS)
-@pytest.mark.parametrize("unfiltered", [False, True])
-def test_moves_between_episodes_are_filtered_unless_allowed(trained, caplog, virtual_time, reset, unfiltered):
-    """LeRobot returns an arm that acts in joint positions by commands of the usual names."""
-    place, variables = RESETS[reset]
-    far = PUSH | {"delta_x.pos": float("inf")}
-
-    def tick(action=PUSH):
-        virtual_time.sleep(PERIOD)
-        robot.get_observation()
-        return robot.send_action(action)
-
-    with make_robot_from_config(config(trained, {"epsilon": ALWAYS}, unfiltered_moves=unfiltered)) as robot:
-        recorded = {"dataset": Recorded(4), "start_episode_t": 1.0}
-        assert looping(RECORD_LOOP, tick, **recorded) != pytest.approx(PUSH)
-        assert (looping(place, tick, **variables) == pytest.approx(PUSH)) == unfiltered
-        assert np.isfinite(list(looping(place, lambda: tick(far), **variables).values())).all()
-        assert looping(RECORD_LOOP, tick, **recorded) != pytest.approx(PUSH)
-
-
-def test_what_anybody_logs_switches_no_filter_off(trained, virtual_time):
-    with make_robot_from_config(config(trained, {"epsilon": ALWAYS}, unfiltered_moves=True)) as robot:
-        for line in ("Recording episode 3", "Reset the environment", "Returning robot to initial position"):
-            logging.getLogger().info(line)
-            virtual_time.sleep(PERIOD)
-            robot.get_observation()
-            assert robot.send_action(PUSH) != pytest.approx(PUSH)
-
-
-def test_another_thread_than_the_loops_moves_nothing_unfiltered(trained):
-    with make_robot_from_config(config(trained, {"epsilon": ALWAYS}, unfiltered_moves=True)) as robot:
-        sent = []
-
-        def reset():
-            robot.get_observation()
-            other = threading.Thread(target=lambda: sent.append(robot.send_action(PUSH)))
-            other.start()
-            other.join()
-
-        looping(sorted(BETWEEN)[0], reset)
-        assert sent != [pytest.approx(PUSH)]
-
-
-@pytest.mark.parametrize("level", [logging.WARNING, logging.INFO])
-def test_each_episode_starts_anew_even_one_that_is_recorded_again(robot, monkeypatch, level, virtual_time):
-    """Whatever is logged, and also if no tick comes between two episodes."""
-    logging.getLogger().setLevel(level)
-    starts, reset = [], robot.filter.shield.reset
-    monkeypatch.setattr(robot.filter.shield, "reset", lambda: starts.append(robot.episode) or reset())
-    for episode, began in [(0, 1.0), (0, 1.0), (0, 2.0), (1, 3.0), (1, 3.0)]:
-        virtual_time.sleep(PERIOD)
-        looping(RECORD_LOOP, robot.get_observation, dataset=Recorded(episode), start_episode_t=began)
-        looping(RECORD_LOOP, lambda: robot.send_action(PUSH), dataset=Recorded(episode), start_episode_t=began)
-    assert len(starts) == 3 and robot.inner.episode == 4  # once as it was connected
-
-
-RATES = {
-    "as in the data": (0.05, False),
-    "a bit slower": (0.06, False),
-    "ten times slower": (0.5 + 1e-3, True),
-    "slow, and seen in time": (0.99, True),
-    "hundred times faster": (0.0005, True),
-}
-
-
-@pytest.mark.parametrize("rate", RATES)
-def test_a_loop_of_another_rate_is_not_trusted_from_the_second_tick_on(robot, caplog, virtual_time, rate):
-    gap, wrong = RATES[rate]
-    for _ in range(2):
-        robot.get_observation()
-        robot.send_action(PUSH)
-        virtual_time.sleep(gap)
-    assert (last(robot).reason.item() == Reason.WRONG_RATE) == wrong and ("--fps=20" in caplog.text) == wrong
-
-
-def failing(*_):
-    raise ConnectionError("no answer from the arm")
-
-
-def test_a_robot_that_is_not_read_stays_and_fails_aloud_the_fifth_time(robot, monkeypatch, virtual_time):
-    first = robot.get_observation()
-    robot.send_action(PUSH)
-    told, send = [], robot.inner.send_action
-    monkeypatch.setattr(robot.inner, "send_action", lambda action: told.append(action) or send(action))
-    with monkeypatch.context() as m:
-        m.setattr(robot.inner, "get_observation", failing)
-        for _ in range(MAX_FAILURES - 1):
-            virtual_time.sleep(PERIOD)
-            again = robot.get_observation()
-            assert all(np.array_equal(again[name], first[name]) for name in robot.observation_features)
-            assert robot.send_action(PUSH) == pytest.approx(STILL)
-            assert last(robot).reason.item() == Reason.OBSERVATION_STALE
-        told.clear()
-        with pytest.raises(ConnectionError):
-            robot.get_observation()
-        assert told == [pytest.approx(STILL)]
-    virtual_time.sleep(PERIOD)
-    assert robot.send_action(PUSH) == pytest.approx(PUSH) and last(robot).reason.item() == Reason.PASSED
-
-
-def test_a_robot_that_shows_nothing_at_all_fails_at_once(robot, monkeypatch):
-    monkeypatch.setattr(robot.inner, "get_observation", failing)
-    calls = []
-    monkeypatch.setattr(robot.inner, "send_action", lambda action: calls.append(action) or action)
-    for call in (
-        robot.get_observation,
-        lambda: robot.send_action(PUSH),
-        lambda: robot.send_action({"joint_1.pos": 0.0}),
-    ):
-        with pytest.raises(ConnectionError):
-            call()
-    assert not any(action == PUSH for action in calls)
-
-
-def test_a_robot_that_takes_no_action_fails_aloud_the_fifth_time(robot, monkeypatch, virtual_time):
-    with monkeypatch.context() as m:
-        m.setattr(robot.inner, "send_action", failing)
-        for _ in range(MAX_FAILURES - 1):
-            assert robot.send_action(PUSH) == pytest.approx(PUSH)  # what it was told, if not what it did
-            virtual_time.sleep(PERIOD)
-        with pytest.raises(ConnectionError):
-            robot.send_action(PUSH)
-    assert sum(robot.filter.shield.failures.values()) == MAX_FAILURES - 1
-    virtual_time.sleep(PERIOD)
-    assert robot.send_action(PUSH) == pytest.approx(PUSH)
-
-
-REPORTS = {
-    "nothing": None,
-    "no names": [0.0],
-    "not a number": PUSH | {"delta_y.pos": float("nan")},
-    "no value": PUSH | {"delta_y.pos": None},
-    "other names": {"joint_1.pos": 0.3},
-    "fewer names": {"gripper.pos": 1.0},
-}
-
-
-@pytest.mark.parametrize("report", REPORTS)
-def test_a_robot_that_does_not_say_what_it_did_did_what_it_was_told(robot, monkeypatch, caplog, virtual_time, report):
-    monkeypatch.setattr(robot.inner, "send_action", lambda _: REPORTS[report])
-    for _ in range(3):
-        assert robot.send_action(PUSH) == pytest.approx(PUSH)
-        assert robot.filter.shield.guard.told.tolist() == [pytest.approx([*PUSH.values()])]
-        virtual_time.sleep(PERIOD)
-    assert caplog.text.count("does not say what it executed") == 1
 
 
 def policy_decision(robot, trained):
@@ -599,7 +182,7 @@ def test_a_blind_robot_takes_nothing_from_another(twins, monkeypatch):
     monkeypatch.setattr(blind.inner, "get_observation", lambda: read() | {"wrist": np.zeros((32, 32, 3), np.uint8)})
     assert seeing.send_action(PUSH) == pytest.approx(PUSH)
     assert blind.send_action(PUSH) == pytest.approx(STILL)
-    assert last(blind).reason.item() == MISSING and last(seeing).reason.item() == Reason.PASSED
+    assert last(blind).reason.item() == Reason.OBSERVATION_MISSING and last(seeing).reason.item() == Reason.PASSED
 
 
 @pytest.mark.parametrize("alike", [True, False])
@@ -1083,7 +666,7 @@ def test_whatever_a_plugin_changes_the_dataset_holds_what_the_robot_was_sent(
     ("how", "words"),
     [
         ("names", "was to store tip_delta_x.*, and the robot was sent delta_x"),
-        ("the robot's names", "held still; use a teleoperator that commands delta_x"),
+        ("the robot's names", "held still.*Use a teleoperator that commands delta_x"),
         ("frames that are stored already", r"was to store \[.*\], and the robot was sent \["),
     ],
 )

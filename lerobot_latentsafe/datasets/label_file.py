@@ -133,9 +133,14 @@ def read_label_file(path: Path) -> tuple[Written | None, LabelTable]:
         LabelFileError: not readable, another schema, or a column or an entry that is not what it must be.
     """
     try:
-        table = pq.ParquetFile(path).read()
-    except (pa.ArrowException, OSError) as e:
+        return _read(path)
+    except (pa.ArrowException, OSError, UnicodeError) as e:
         raise LabelFileError(f"{path} is not a readable parquet file ({e}); restore it or move it away") from e
+
+
+def _read(path: Path) -> tuple[Written | None, LabelTable]:
+    table = pq.ParquetFile(path, page_checksum_verification=True).read()
+    table.validate(full=True)
     missing = {"index", "failure"} - set(table.column_names)
     if missing:
         raise LabelFileError(f"{path} lacks the columns {sorted(missing)}; expected index and failure")

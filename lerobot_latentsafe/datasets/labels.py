@@ -232,6 +232,7 @@ class Sidecar(FrameLabels):
                 use_dictionary=["labelled_by", "labelled_at"],
                 column_encoding={"index": "DELTA_BINARY_PACKED"},
                 compression="zstd",
+                write_page_checksum=True,
             )
 
 

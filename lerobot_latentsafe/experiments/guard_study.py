@@ -73,7 +73,8 @@ def replayed(shield: Shield, episode: Recorded) -> Iterator[FilterDecision]:
 
 def alarms(policy: LatentSafePolicy, episodes: Iterator[Recorded]) -> dict[str, object]:
     """How often something is found wrong with healthy episodes, and why; and what a tick costs, CPU milliseconds."""
-    shield, reasons, took = Shield(policy.model, clock=standing_still), Counter[str](), []
+    shield, reasons = Shield(policy.model, clock=standing_still), Counter[str]()
+    took: list[float] = []
     n_episodes = 0
     for episode in episodes:
         n_episodes += 1

@@ -23,21 +23,22 @@ import torch
 from lerobot.scripts import lerobot_train
 from safetensors.torch import load_file
 
-from lerobot_latentsafe import cli
-from lerobot_latentsafe.cli import evaluate, label, train  # noqa: F401  (loaded before anything is forked)
 from lerobot_latentsafe.collection import dubins, franka, so101
 from lerobot_latentsafe.experiments.blocks import dreamer_training  # noqa: F401
 from lerobot_latentsafe.franka.scenes import SCENES
+from lerobot_latentsafe.labeling.store import LabelStore
 
 LONGEST_S = 600
 """A run that takes longer hangs."""
-CAR, MODEL, FILTER = "car", "world_model", "filter"
+CAR, DEMONSTRATIONS, MODEL, FILTER = "car", "demonstrations", "world_model", "filter"
 """Folders of what the verbs start from."""
 SMALL = {"type": "rssm", "deterministic": 16, "stochastic": 4, "hidden": 16, "units": 16, "clip_length": 6}
 SIZES = [f"world_model.{name}={value}" for name, value in SMALL.items()]
 SIZES += ["margin.clips=64", "reachability.critic_hidden=[16]", "reachability.actor_hidden=[16]"]
 SIZES += ["reachability.steps=60", "reachability.pool=512", "reachability.horizon=4", "reachability.batch_size=32"]
 SIZES += ["reachability.refresh=10"]
+Run = Callable[[list[str]], None]
+"""The command `latentsafe`, given what is typed after it."""
 
 
 @dataclass(frozen=True)
@@ -48,11 +49,13 @@ class Verb:
         typed: verb and options.
         product: what it leaves in `{out}`.
         again: what is typed after a kill, given `{out}`; None: the same.
+        within: a dataset of `{made}` that it writes into, of which each run has a copy in `{out}/out`.
     """
 
     typed: str
     product: str = "out"
     again: Callable[[Path], list[str]] | None = None
+    within: str | None = None
 
 
 def data(name: str) -> str:
@@ -91,7 +94,7 @@ def _resumed_training(out: Path) -> list[str]:
 
 
 VERBS = {
-    "collect, car": Verb(f"{COLLECT} --source=random --dataset.num_episodes=12"),
+    "collect, car": Verb(f"{COLLECT} --source=random --dataset.num_episodes=9"),
     "collect, Franka": Verb(f"{COLLECT} --source=blocks_demos --dataset.num_episodes=4"),
     "collect, SO-101": Verb(f"{COLLECT} --source=so101_mix --dataset.num_episodes=4"),
     "cache": Verb(f"cache {data(CAR)} --image_size=64 --output_dir={{out}}/out"),
@@ -103,11 +106,16 @@ VERBS = {
     "train-dreamer": Verb(DREAMER),
     "calibrate": Verb(f"calibrate --policy.path={{made}}/{FILTER} {data('car_cache')} --output_dir={{out}}/out"),
     "report": Verb(
-        f"report --policy.path={{made}}/{FILTER} --env.type=latentsafe_dubins --env.episode_length=20 --n_episodes=3 "
+        f"report --policy.path={{made}}/{FILTER} --env.type=latentsafe_dubins --env.episode_length=8 --n_episodes=2 "
         "--base_policy_path=dubins_diffusion_reckless --output={out}/out/report.html"
     ),
+    "auto-label": Verb(
+        f"auto-label --dataset.repo_id=me/{DEMONSTRATIONS} --dataset.root={{out}}/out --labeller=dubins_truth "
+        "--specification=crashed",
+        within=DEMONSTRATIONS,
+    ),
     "write-labels": Verb(
-        f"write-labels {data(CAR)} --specifications=[failure] --new_repo_id=me/labelled --output_dir={{out}}/out"
+        f"write-labels {data(CAR)} --specifications=[crashed] --new_repo_id=me/labelled --output_dir={{out}}/out"
     ),
 }
 
@@ -126,7 +134,7 @@ def shrink() -> None:
     torch.randn_like = torch.zeros_like
 
 
-def start(words: list[str], log: Path) -> int:
+def start(words: list[str], log: Path, run: Run) -> int:
     """The number of a new process, leader of its group, that runs a command."""
     process = os.fork()
     if process:
@@ -138,7 +146,11 @@ def start(words: list[str], log: Path) -> int:
         os.dup2(descriptor, 1)
         os.dup2(descriptor, 2)
         shrink()
-        _command(words)
+        if words[0] == "lerobot-train":
+            sys.argv = words
+            lerobot_train.main()
+        else:
+            run(words)
         status = 0
     except SystemExit as e:
         print(e, file=sys.stderr)
@@ -149,14 +161,6 @@ def start(words: list[str], log: Path) -> int:
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(status)
-
-
-def _command(words: list[str]) -> None:
-    if words[0] == "lerobot-train":
-        sys.argv = words
-        lerobot_train.main()
-    else:
-        cli.main(words)
 
 
 def ended(process: int, within_s: float) -> int | None:
@@ -173,14 +177,14 @@ def ended(process: int, within_s: float) -> int | None:
     return None
 
 
-def finished(words: list[str], log: Path) -> float:
+def finished(words: list[str], log: Path, run: Run) -> float:
     """Run a command to its end; the seconds that it took.
 
     Raises:
         RuntimeError: it failed, with what it said.
     """
     began = time.monotonic()
-    status = ended(start(words, log), LONGEST_S)
+    status = ended(start(words, log, run), LONGEST_S)
     if status != 0:
         raise RuntimeError(f"{' '.join(words)}: status {status}: {log.read_text()[-2000:]}")
     return time.monotonic() - began
@@ -197,7 +201,8 @@ def left_by(folder: Path) -> dict[str, object]:
 
 def _content(path: Path) -> object:
     if path.suffix == ".parquet":
-        return pq.read_table(path).to_pydict()
+        table = pq.read_table(path)
+        return table.drop_columns([name for name in table.column_names if name == "labelled_at"]).to_pydict()
     if path.suffix == ".safetensors":
         return {name: (str(t.dtype), t.shape, t.reshape(-1).view(torch.uint8).numpy().tobytes())
                 for name, t in load_file(path).items()}  # fmt: skip
@@ -219,39 +224,44 @@ def differences(one: dict[str, object], other: dict[str, object]) -> list[str]:
 # -- the measurement ---
 
 
-def make(made: Path) -> None:
+def make(made: Path, run: Run) -> None:
     """What the verbs start from: a dataset with labels, its cache, a world model, a filter and a policy."""
     made.mkdir(parents=True)
     places = {"made": made, "out": made}
     for words in (
         f"collect --source=random --dataset.repo_id=me/{CAR} --dataset.root={{made}}/{CAR} --dataset.num_episodes=24",
+        f"collect --source=reckless --dataset.repo_id=me/{DEMONSTRATIONS} --dataset.root={{made}}/{DEMONSTRATIONS} "
+        "--dataset.num_episodes=24",
         f"cache {data(CAR)} --output_dir={{made}}/car_cache",
         f"{TRAIN} --steps=4 --save_freq=4",
     ):
-        finished(words.format(**places).split(), made / "log.txt")
+        finished(words.format(**places).split(), made / "log.txt", run)
     shutil.copytree(made / "out" / "checkpoints" / "last" / "pretrained_model", made / MODEL)
+    store = LabelStore(made / CAR, f"me/{CAR}", ["crashed"])
+    for episode in range(len(store)):
+        store.label("crashed", episode, episode % 5, "somebody")
+    store.close()
     words = f"train-reachability --policy.path={{made}}/{MODEL} {data('car_cache')} --output_dir={{made}}/{FILTER}"
-    finished(words.format(**places).split(), made / "log.txt")
+    finished(words.format(**places).split(), made / "log.txt", run)
 
 
-def kills(verb: Verb, made: Path, folder: Path, n: int, rng: np.random.Generator) -> dict:
+def kills(verb: Verb, made: Path, folder: Path, n: int, rng: np.random.Generator, run: Run) -> dict:
     """Kill a verb n times at a random moment of its course, start it again each time, and compare.
 
     Returns:
         seconds of an undisturbed run, kills that came in time, runs that ended as that one, and what differs or was
         said in the others.
     """
-    whole, log = folder / "whole", folder / "log.txt"
-    whole.mkdir(parents=True)
-    seconds = finished(_typed(verb, made, whole), log)
+    log = folder / "log.txt"
+    whole = _begun(verb, made, folder / "whole")
+    seconds = finished(_typed(verb, made, whole), log, run)
     expected, equal, in_time, wrong = left_by(whole / verb.product), 0, 0, []
     for trial in range(n):
-        out = folder / f"killed_{trial}"
-        out.mkdir()
+        out = _begun(verb, made, folder / f"killed_{trial}")
         moment = rng.uniform(0.05, 0.95) * seconds
-        in_time += ended(start(_typed(verb, made, out), log), moment) is None
+        in_time += ended(start(_typed(verb, made, out), log, run), moment) is None
         words = (verb.again(out) if verb.again else []) or _typed(verb, made, out)
-        status = ended(start(words, log), LONGEST_S)
+        status = ended(start(words, log, run), LONGEST_S)
         found = differences(left_by(out / verb.product), expected)
         # A run that had come to its end is told that it has.
         if not found and (status == 0 or "exists already" in log.read_text()) and not _left_over(out):
@@ -263,6 +273,14 @@ def kills(verb: Verb, made: Path, folder: Path, n: int, rng: np.random.Generator
     return {"seconds": round(seconds, 2), "kills": n, "in_time": in_time, "equal": equal, "wrong": wrong}
 
 
+def _begun(verb: Verb, made: Path, out: Path) -> Path:
+    """The folder of a new run."""
+    out.mkdir(parents=True)
+    if verb.within:
+        shutil.copytree(made / verb.within, out / "out")
+    return out
+
+
 def _typed(verb: Verb, made: Path, out: Path) -> list[str]:
     return verb.typed.format(made=made, out=out).split()
 
@@ -272,12 +290,12 @@ def _left_over(out: Path) -> list[str]:
     return sorted(p.name for p in out.iterdir() if p.name != "out")
 
 
-def kill_verbs(folder: Path, names: list[str], n: int, seed: int) -> dict[str, dict]:
+def kill_verbs(folder: Path, names: list[str], n: int, seed: int, run: Run) -> dict[str, dict]:
     """The table: verb -> see `kills`; what is done already is read from a file, so that this goes on after a kill."""
     made, rows = folder / "made", {}
     if not (made / "done").exists():
         shutil.rmtree(made, ignore_errors=True)
-        make(made)
+        make(made, run)
         (made / "done").touch()
     for name in names:
         note = folder / f"{re.sub('[^a-z0-9]+', '_', name.lower())}.json"
@@ -285,7 +303,7 @@ def kill_verbs(folder: Path, names: list[str], n: int, seed: int) -> dict[str, d
             work = folder / note.stem
             shutil.rmtree(work, ignore_errors=True)
             rng = np.random.default_rng([seed, *name.encode()])
-            note.write_text(json.dumps(kills(VERBS[name], made, work, n, rng)))
+            note.write_text(json.dumps(kills(VERBS[name], made, work, n, rng, run)))
         rows[name] = json.loads(note.read_text())
         print(name, {key: value for key, value in rows[name].items() if key != "wrong"}, flush=True)
     return rows
