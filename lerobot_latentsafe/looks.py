@@ -28,7 +28,7 @@ KEPT, REPEATS = 8, 2
 """Different pictures that are remembered; and ticks in a row after which a picture that comes again is an old one."""
 MOVED = 0.05
 """Standard deviations by which a number of the state may always change unseen."""
-UNSEEN_FACTOR = 1.5
+UNSEEN_FACTOR = 2.5
 """Times what the dataset shows to change unseen, beyond which a picture that stays the same is an old one."""
 
 ALTERATIONS: dict[str, Callable[[Tensor], Tensor]] = {
