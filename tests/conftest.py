@@ -19,8 +19,12 @@ import faulty
 import pytest
 import tiny
 import torch
+from hypothesis import settings
 
 torch.set_num_threads(1)
+# The same examples in every run of the suite; scripts/fuzz.py draws others.
+settings.register_profile("suite", max_examples=75, derandomize=True, database=None)
+settings.load_profile("suite")
 # torchcodec without system FFmpeg logs a page of traceback; LeRobot then falls back to pyav by itself.
 logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
 

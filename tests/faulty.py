@@ -25,7 +25,7 @@ PASSES_ALL, PASSES_NOTHING = -2.0, 2.0
 """Thresholds."""
 
 
-@dataclass
+@dataclass(repr=False)
 class Bench:
     """A filter whose threshold passes whatever is not faulty, and robots that show and want nothing wrong.
 
