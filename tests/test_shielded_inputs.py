@@ -163,7 +163,7 @@ def test_a_monitor_changes_no_action(trained, monkeypatch, virtual_time, fault):
         told = []
         monkeypatch.setattr(robot.inner, "send_action", lambda action: told.append(action) or action)
         for _ in range(2):
-            assert robot.send_action(action) is action
+            assert robot.send_action(action) == action
             virtual_time.sleep(PERIOD)
         assert told == [action] * 2
         assert last(robot) is None or last(robot).unsafe.item()

@@ -71,6 +71,7 @@ class LatentSafeShielded(WrappedRobot):
     def connect(self, calibrate: bool = True) -> None:
         """Connect the inner robot."""
         self.inner.connect(calibrate)
+        self._sent.clear()
         self._forget()
         _connected.append(self)
 
@@ -204,9 +205,7 @@ class LatentSafeShielded(WrappedRobot):
             if decision is None:
                 fault = Reason.OBSERVATION_STALE if self._unread else Reason.PASSED
                 decision = shield(batch, proposed, age_s, fault=fault)
-        except UnknownPoseError:
-            raise
-        except Exception as e:
+        except Exception as e:  # it may be known here what is to stay
             shield.note_failure("the filter could not decide", e)
             return None
         if decision.reason.item() == Reason.WRONG_RATE:
