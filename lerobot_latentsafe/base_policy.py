@@ -180,7 +180,7 @@ def base_to_shield(folder: Path, chosen: str | None) -> str | None:
     Raises:
         CheckpointError: the folder's own configuration names another place, or nothing is there.
     """
-    own = read_json(folder / CONFIG).get("base_policy_path")
+    own = getattr(read_config(folder), "base_policy_path", None)
     if chosen is None or chosen != own or chosen == parse_arg("policy.base_policy_path"):
         return chosen
     base = inside(folder, BASE_FOLDER)

@@ -192,6 +192,37 @@ class FilterDecision:
     heard: Tensor | None = None
 
 
+class Overrides:
+    """What the law's threshold and its retreat depend on: which of the last steps of B robots were overridden.
+
+    Attributes:
+        recent: bool (B, RECENT), whether the filter acted, the latest last.
+        retreated: int64 (B,), steps of a retreat that goes on.
+    """
+
+    def __init__(self, n: int, device: torch.device):
+        self.recent = torch.zeros(n, RECENT, dtype=torch.bool, device=device)
+        self.retreated = torch.zeros(n, dtype=torch.long, device=device)
+
+    def threshold(self, law: LawConfig) -> Tensor:
+        """What V must exceed (B,): epsilon, and `resume_above` where the fallback acts. Infinite for the first
+        `min_retreat_steps` steps of a retreat."""
+        threshold = torch.where(self.recent[:, -1], max(law.epsilon, law.resume_above), law.epsilon)
+        return torch.where((self.retreated > 0) & (self.retreated < law.min_retreat_steps), torch.inf, threshold)
+
+    def retreats(self, law: LawConfig) -> Tensor:
+        """Whether an override now would be the retreat's: one goes on, or the critic's action has been tried: (B,)."""
+        tried = self.recent.sum(1) >= law.retreat_after
+        return (self.retreated > 0) | tried if law.retreat else torch.zeros_like(tried)
+
+    def after(self, acts: Tensor, retreats: Tensor) -> "Overrides":
+        """One step on: whether the filter acted, and whether an override is the retreat's, bool (B,)."""
+        new = Overrides(len(acts), acts.device)
+        new.recent = torch.cat([self.recent[:, 1:], acts[:, None]], 1)
+        new.retreated = (self.retreated + 1) * (acts & retreats)
+        return new
+
+
 def least_restrictive(
     proposed: Tensor,
     fallback: Tensor,

@@ -120,9 +120,9 @@ def _infos(folder: Path) -> Iterator[Path]:
 def _is_repo_id(repo_id: Any) -> bool:
     try:
         validate_repo_id(repo_id)
-    except (HFValidationError, TypeError):
+    except HFValidationError:
         return False
-    return True
+    return isinstance(repo_id, str)
 
 
 def _flat(feature: dict | None) -> list[str] | None:

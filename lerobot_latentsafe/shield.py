@@ -17,7 +17,14 @@ import torch
 from torch import Tensor
 
 from lerobot_latentsafe.configuration_latentsafe import SEALED
-from lerobot_latentsafe.decision import RECENT, FilterDecision, Reason, by_checks_alone, first_fault, least_restrictive
+from lerobot_latentsafe.decision import (
+    FilterDecision,
+    Overrides,
+    Reason,
+    by_checks_alone,
+    first_fault,
+    least_restrictive,
+)
 from lerobot_latentsafe.guard import UNSEEN, Guard, Pace, Seen
 from lerobot_latentsafe.latent import Belief, Latent, is_sound, map_latent, replace_rows
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
@@ -91,8 +98,7 @@ class Shield:
         self.observed: dict[str, Tensor] | None = None
         self.decision: FilterDecision | None = None
         self.decided_at: float | None = None
-        self.recent: Tensor | None = None
-        self.retreated: Tensor | None = None
+        self.overrides: Overrides | None = None
         self._told = False
 
     @torch.no_grad()
@@ -108,7 +114,7 @@ class Shield:
                 units.hold(self.guard.pose).nan_to_num(0.0),
                 torch.zeros(1, dtype=torch.long, device=units.device),
             )
-            self._forget_overrides(1)
+            self.overrides = Overrides(1, units.device)
             self._judge(Seen(images, self.guard.pose, fault), fault, self._hear(hold), hold)
             self._warm = True
             self._forget()
@@ -155,8 +161,7 @@ class Shield:
             faults, proposed, clipped = self.guard.check_action(proposed, faults, hold, missing_reason, planned)
             for found in (fault, rate):
                 faults = first_fault(faults, torch.ones_like(faults, dtype=torch.bool), found)
-            if self.recent is None:
-                self._forget_overrides(len(hold))
+            self.overrides = self.overrides or Overrides(len(hold), hold.device)
             # What is wrong is not judged: in its place stands what would be done instead, to stay.
             judged = self._hear(torch.where((faults != Reason.PASSED)[:, None], hold, clipped))
             judgement, faults = self._judge(seen, faults, judged, hold)
@@ -212,7 +217,7 @@ class Shield:
         both = {key: torch.cat([predicted[key], latent[key]]) for key in latent}  # one pass through imagination
         sizes = [len(on_the_way), len(hold)]
         (value, here), (_, action) = (part.split(sizes) for part in model.plan(both))
-        retreats = self._retreats()
+        retreats = self.overrides.retreats(model.config.law)
         moves = retreats & torch.isfinite(here)  # where nothing is known, nothing moves
         fallback = torch.where(moves[:, None], self._retreat(hold), self._usable(action, here, hold))
         # A margin that is negative now, or on the way, is a failure whatever comes after.
@@ -225,8 +230,8 @@ class Shield:
     ) -> FilterDecision:
         """The law's decision, once all that can be known is known."""
         law, value = self.model.config.law, judgement.value
-        threshold = self._threshold()
-        fallback = torch.where(self._stays(faults, value, seen.state), hold, judgement.fallback)
+        threshold = self.overrides.threshold(law)
+        fallback = torch.where(self._stays(faults, value, threshold, seen.state), hold, judgement.fallback)
         monitors = law.mode == "monitor"
         if law.name == "guard":
             return by_checks_alone(proposed, hold, faults, monitors, clipped)
@@ -235,9 +240,7 @@ class Shield:
     def _remember(
         self, judgement: Judgement, decision: FilterDecision, observation: dict[str, Any], finished: float
     ) -> None:
-        acts = decision.intervened
-        self.recent = torch.cat([self.recent[:, 1:], acts[:, None]], 1)
-        self.retreated = (self.retreated + 1) * (acts & judgement.retreats)
+        self.overrides = self.overrides.after(decision.intervened, judgement.retreats)
         self.belief, self.decision, self.decided_at = judgement.belief, decision, finished
         self.observed = {key: observation[key] for key in self.model.inputs if key in observation}
         self.was_executed(decision.action)
@@ -263,26 +266,15 @@ class Shield:
         trace = error if self.failures[what] == 1 else None
         logger.error("%s (%s: %s); nothing passes for that", what, type(error).__name__, error, exc_info=trace)
 
-    def _stays(self, fault: Tensor, value: Tensor, state: Tensor) -> Tensor:
+    def _stays(self, fault: Tensor, value: Tensor, threshold: Tensor, state: Tensor) -> Tensor:
         """Commands (B, A) that stay as they were, instead of the fallback's.
 
         A fault does not move a robot for which staying is safe, as far as is known; and a target moves nowhere from a
         place that is not known.
         """
         units, broken = self.model.units, (fault != Reason.PASSED) & (fault != Reason.NO_BASE_POLICY)
-        stays = (broken & (value > self._threshold())) | ~value.isfinite()
+        stays = (broken & (value > threshold)) | ~value.isfinite()
         return stays[:, None] | (units.is_target & units.seen(state).isnan())
-
-    def _forget_overrides(self, n: int) -> None:
-        """For n robots: of the last steps, whether they were overridden; and the steps of a retreat that goes on."""
-        self.recent = torch.zeros(n, RECENT, dtype=torch.bool, device=self.model.device)
-        self.retreated = torch.zeros(n, dtype=torch.long, device=self.model.device)
-
-    def _retreats(self) -> Tensor:
-        """Whether an override now would be the retreat's: one goes on, or the critic's action has been tried: (B,)."""
-        law = self.model.config.law
-        tried = self.recent.sum(1) >= law.retreat_after
-        return (self.retreated > 0) | tried if law.retreat else torch.zeros_like(tried)
 
     def _retreat(self, hold: Tensor) -> Tensor:
         """The motion of `law.retreat`, with all other commands as they were: (B, A) in robot units."""
@@ -291,13 +283,6 @@ class Shield:
             i = units.action_names.index(name)
             action[:, i] = motion + (hold[:, i] if units.is_target[i] else 0.0)
         return action
-
-    def _threshold(self) -> Tensor:
-        """What V must exceed: epsilon, and `resume_above` where the fallback acts. Infinite for the first
-        `min_retreat_steps` steps of a retreat."""
-        law, acting = self.model.config.law, self.recent[:, -1]
-        threshold = torch.where(acting, max(law.epsilon, law.resume_above), law.epsilon)
-        return torch.where((self.retreated > 0) & (self.retreated < law.min_retreat_steps), torch.inf, threshold)
 
     def _tell(self, decision: FilterDecision) -> None:
         """Log the first override of an episode."""
@@ -330,7 +315,7 @@ class Shield:
             with self._lock, other._lock:
                 if not (other._decided(observation, action) and self._accepts(other)):
                     continue
-                for name in ("belief", "executed", "observed", "decision", "decided_at", "recent", "retreated"):
+                for name in ("belief", "executed", "observed", "decision", "decided_at", "overrides"):
                     setattr(self, name, getattr(other, name))
                 self.guard.adopt(other.guard)
                 return self.decision

@@ -17,8 +17,10 @@ from lerobot_latentsafe.looks import Look
 from lerobot_latentsafe.meanings import Command, parse
 
 STAGES = ("untrained", "guard", "world_model", "critic")
-RANGE_TOLERANCE = 0.1
-"""Share of the data's range by which a command may leave it: it is clipped, and judged and executed as clipped."""
+RANGE_TOLERANCE, TARGET_TOLERANCE = 0.1, 0.5
+"""Share of the data's range by which a command may leave it: it is clipped, and judged and executed as clipped. Places
+that a few dozen episodes reach differ more from those of the next than motions do, and a clipped target is a place that
+the data reach."""
 STATE_TOLERANCE = 1.0
 """Share of the data's range by which a number of the state may leave it and still be believed."""
 LEAP_TOLERANCE = 0.5
@@ -238,8 +240,10 @@ class Units(nn.Module):
     @property
     def furthest_unanswered(self) -> Tensor:
         """How far each command may go while the state stays as it is: (A,); infinite where that is never told."""
-        twice = 2 * (self.unanswered + torch.maximum(self.motion_low.abs(), self.motion_high.abs()))
-        return torch.where(self.action_varies & ~self.frozen, twice, torch.inf)
+        step = torch.where(
+            self.is_target, self.action_step, torch.maximum(self.motion_low.abs(), self.motion_high.abs())
+        )
+        return torch.where(self.action_varies & ~self.frozen, 2 * self.unanswered + step, torch.inf)
 
     def unknown(self, n: int) -> Tensor:
         """Actions of which nothing is known, NaN: (n, A)."""
@@ -258,7 +262,7 @@ class Units(nn.Module):
         """
         far, low, high = self.beyond(action), self.action_low, self.action_high
         if self.has_targets:
-            pose, margin = self.seen(state), RANGE_TOLERANCE * (self.displacement_high - self.displacement_low)
+            pose, margin = self.seen(state), TARGET_TOLERANCE * (self.displacement_high - self.displacement_low)
             nearest, furthest = pose + self.displacement_low, pose + self.displacement_high
             far |= self.is_target & ((action < nearest - margin) | (action > furthest + margin))
             # A robot that stands beyond the range of the targets may stay there.
@@ -268,7 +272,7 @@ class Units(nn.Module):
 
     def beyond(self, action: Tensor) -> Tensor:
         """Which commands (..., A) leave the data's range by more than the tolerance, wherever the robot is."""
-        margin = RANGE_TOLERANCE * (self.action_high - self.action_low)
+        margin = torch.where(self.is_target, TARGET_TOLERANCE, RANGE_TOLERANCE) * (self.action_high - self.action_low)
         return (action < self.action_low - margin) | (action > self.action_high + margin)
 
     def leaps(self, action: Tensor, before: Sequence[Tensor]) -> Tensor:

@@ -2,6 +2,7 @@
 
 import logging
 import sys
+from types import ModuleType
 
 import pytest
 import torch
@@ -82,6 +83,28 @@ def test_dino_without_transformers_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "transformers", None)
     with pytest.raises(EncoderError, match="dino"):
         load_encoder("dinov2")
+
+
+def test_an_encoder_that_a_checkpoint_names_is_not_fetched_and_runs_no_code(monkeypatch):
+    asked = []
+
+    class AutoModel:
+        @staticmethod
+        def from_pretrained(name, **options):
+            asked.append((name, options))
+            raise OSError("not in the cache")
+
+    stub = ModuleType("transformers")
+    stub.AutoModel = AutoModel
+    monkeypatch.setitem(sys.modules, "transformers", stub)
+    with pytest.raises(EncoderError, match="nothing is fetched because a checkpoint names it"):
+        load_encoder("evil/encoder", expected_hash="0" * 16)
+    with pytest.raises(EncoderError, match="nor to be had from the Hub"):
+        load_encoder("mine/encoder")  # of a user's own --encoder
+    assert [(name, options.get("local_files_only", False)) for name, options in asked] == [
+        ("evil/encoder", True), ("mine/encoder", True), ("mine/encoder", False)
+    ]  # fmt: skip
+    assert all(options["trust_remote_code"] is False and options["use_safetensors"] for _, options in asked)
 
 
 @pytest.mark.parametrize("registers", [0, 4])

@@ -7,6 +7,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.robots.utils import make_robot_from_config
 from lerobot.teleoperators.utils import make_teleoperator_from_config
 from lerobot.utils.errors import DeviceNotConnectedError
+from lerobot_loops import RECORD_LOOP, Recorded, looping
 
 from lerobot_latentsafe.franka.actions import ACTION_NAMES, DELTA_NAMES, JOINT_NAMES, STATE_NAMES
 from lerobot_latentsafe.franka.behaviors import BAG, BLOCKS
@@ -61,19 +62,12 @@ def test_lerobots_return_to_the_start_is_a_joint_move(robot):
     assert all(abs(now[name] - start[name]) < 0.02 for name in STATE_NAMES)
 
 
-def test_an_announced_episode_starts_from_its_own_seed(robot):
-    log = logging.getLogger()
-    level = log.level
-    log.setLevel(logging.INFO)
-    try:
-        at = []
-        for announcement in ("Recording episode 2", "Reset the environment", "Recording episode 0"):
-            logging.info(announcement)
-            robot.get_observation()
-            at.append(robot.scene.seed)
-    finally:
-        log.setLevel(level)
-    assert at == [5, 5, 3]
+def test_an_episode_of_lerobots_starts_from_its_own_seed(robot):
+    at = []
+    for dataset, began in ((Recorded(2), 1.0), (Recorded(2), 1.0), (None, 2.0), (Recorded(0), 3.0)):
+        looping(RECORD_LOOP, robot.get_observation, dataset=dataset, start_episode_t=began)
+        at.append(robot.scene.seed)
+    assert at == [5, 5, 5, 3] and robot.episode == 3
 
 
 def test_replaying_what_an_operator_did_gives_the_same_states(robot):

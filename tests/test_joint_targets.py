@@ -173,8 +173,8 @@ def test_nothing_is_commanded_to_an_arm_that_nobody_has_seen(arm):
     [
         ([-70.0, 68.0, 20.0], Reason.PASSED, [-70.0, 68.0, 20.0]),
         ([-71.0 + 6.5, 68.0, 20.0], Reason.PASSED, [-65.0, 68.0, 20.0]),  # a little too far at once
-        ([-71.0 - 7.0, 68.0, 20.0], Reason.PASSED, [-77.0, 68.0, 20.0]),
-        ([-71.0 + 7.5, 68.0, 20.0], Reason.ACTION_OUT_OF_RANGE, tiny.ARM_POSE),
+        ([-71.0 - 11.0, 68.0, 20.0], Reason.PASSED, [-77.0, 68.0, 20.0]),
+        ([-71.0 + 12.5, 68.0, 20.0], Reason.ACTION_OUT_OF_RANGE, tiny.ARM_POSE),
         ([109.0, -112.0, 20.0], Reason.ACTION_OUT_OF_RANGE, tiny.ARM_POSE),
     ],
 )

@@ -51,7 +51,7 @@ def seen(episode, t, task="push"):
 def record(root, episodes, resume=False, video=False, streaming=False):
     """As LeRobot's recording does, until the dataset holds so many episodes."""
     now = []
-    with storing_what_was_sent(root, resume, lambda: sent(*now)):
+    with storing_what_was_sent(root, resume, lambda: sent(*now)) as resume:
         options = {"root": root, "image_writer_threads": 2, "streaming_encoding": streaming}
         if resume:
             dataset = LeRobotDataset.resume(REPO, **options)
@@ -262,7 +262,7 @@ def another_process_has(root):
 
 def test_what_cannot_go_on_is_refused(tmp_path):
     root = tmp_path / "data"
-    with pytest.raises(ValueError, match="no recording to go on with; leave --resume out"):
+    with pytest.raises(ValueError, match="to go on with; leave --resume out"):
         record(root, 1, resume=True)
     assert not root.exists()
     record(root, 1)
@@ -273,11 +273,22 @@ def test_what_cannot_go_on_is_refused(tmp_path):
     assert read_by_lerobot(root) == expected(1)
 
 
-def test_a_recording_that_was_killed_before_its_first_episode_goes_on(tmp_path):
+@pytest.mark.parametrize(
+    ("where", "nth"),
+    [(f"{META}.write_info", 1), ("json.dump", 1), (f"{OURS}.write_into", 1), (f"{WRITER}.add_frame", 2)],
+)
+def test_a_recording_that_was_killed_before_its_first_episode_goes_on(tmp_path, where, nth):
     root = tmp_path / "data"
-    killed(lambda: record(root, 1), f"{WRITER}.add_frame", 2)
+    killed(lambda: record(root, 1), where, nth)
     record(root, 1, resume=True)
     assert read_by_lerobot(root) == expected(1)
+
+
+def test_what_is_no_recording_is_not_cleared_away(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(ValueError, match="no recording in"):
+        record(tmp_path, 1, resume=True)
+    assert (tmp_path / "notes.txt").read_text() == "mine"
 
 
 @pytest.mark.parametrize("where", [f"{META}.write_stats", f"{SENT}.write_beside", f"{OURS}.complete"])

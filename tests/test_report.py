@@ -63,7 +63,7 @@ class Still(BasePolicy):
     """A base policy that does not move, with the gripper open."""
 
     def __init__(self):
-        pass
+        self.planned = None
 
     def reset(self):
         pass

@@ -213,10 +213,10 @@ def test_an_older_seal_is_believed_for_what_it_covers(filter_copy):
         load_filter(filter_copy)
 
 
-def test_a_seal_that_covers_less_than_ever_is_no_seal(filter_copy):
-    edit(filter_copy / "integrity.json", lambda record: record.update(
-        entries=[], config_sha256=checkpoint._config_digest(filter_copy, [])))  # fmt: skip
-    with pytest.raises(CheckpointError, match=r"integrity\.json is not readable \(it says nothing of fallback"):
+@pytest.mark.parametrize("entries", [[], ["trained_on"], [3], [["a"]], [*SEALED, 3]])
+def test_a_seal_that_covers_less_than_ever_is_no_seal(filter_copy, entries):
+    edit(filter_copy / "integrity.json", lambda record: record.update(entries=entries))
+    with pytest.raises(CheckpointError, match=r"integrity\.json is not readable \(it says nothing of "):
         load_filter(filter_copy)
 
 
@@ -411,6 +411,18 @@ def test_a_downloaded_checkpoint_names_no_folder_of_this_machine(base, tmp_path,
     (base / ".cache" / "huggingface").mkdir(parents=True)  # of `hf download`
     with pytest.raises(CheckpointError, match="Nothing is fetched"):
         checkpoint.named_by(base, str(tmp_path), "")
+
+
+@pytest.mark.parametrize("repo_id", ["../../x", "/etc", "a/b/c", 3, None, "me/data"])
+def test_a_downloaded_policy_tells_of_no_dataset_in_a_folder_it_names(base, tmp_path, repo_id):
+    info = {"fps": 7, "features": {"action": {"shape": [2], "names": ["b", "a"]}}}
+    (tmp_path / "data" / "meta").mkdir(parents=True)
+    (tmp_path / "data" / "meta" / "info.json").write_text(json.dumps(info))
+    told = {"dataset": {"repo_id": repo_id, "root": str(tmp_path / "data")}}
+    (base / "train_config.json").write_text(json.dumps(told))
+    assert BasePolicy.load(base).origin.fps == 7
+    (base / ".cache" / "huggingface").mkdir(parents=True)
+    assert BasePolicy.load(base).origin.fps is None
 
 
 # -- torn while it was written ---

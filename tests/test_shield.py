@@ -8,7 +8,7 @@ import torch
 
 from lerobot_latentsafe.critic import FallbackConfig
 from lerobot_latentsafe.datasets.clips import Clip
-from lerobot_latentsafe.decision import LawConfig, Reason
+from lerobot_latentsafe.decision import LawConfig, Overrides, Reason
 from lerobot_latentsafe.shield import Shield
 
 IMAGE = "observation.image"
@@ -301,10 +301,10 @@ def test_once_the_filter_acts_the_policy_is_released_above_another_value(permiss
     value = shield(along(1)[0], actions(LEFT)).value
     for acting, release in ((False, 1.0), (True, value.min().item() - 1e-3), (True, value.max().item() + 1e-3)):
         shield.reset()
-        shield._forget_overrides(3)
-        config.law.resume_above, shield.recent[:, -1] = release, acting
+        shield.overrides = Overrides(3, shield.model.device)
+        config.law.resume_above, shield.overrides.recent[:, -1] = release, acting
         assert (shield(along(1)[0], actions(LEFT)).intervened == (release > value) & acting).all()
-        assert shield.recent[:, -2].all() == acting
+        assert shield.overrides.recent[:, -2].all() == acting
 
 
 RETREAT, OUTSIDE = {"turn_rate.vel": -0.5}, [9.0, 1.0]
@@ -367,7 +367,7 @@ def test_retreat_is_a_move_of_the_fallback_not_of_v(tiny_continuous_filter):
     policy.config.law.mode = "monitor"
     policy.shield.reset()
     assert not policy.shield(along(1)[0], actions([0.3, 1.0])).intervened.any()
-    assert not policy.shield.recent.any() and not policy.shield.retreated.any()
+    assert not policy.shield.overrides.recent.any() and not policy.shield.overrides.retreated.any()
 
 
 @pytest.mark.parametrize(

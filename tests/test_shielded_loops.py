@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import tiny
 from lerobot.robots.utils import make_robot_from_config
+from lerobot_loops import RECORD_LOOP, Recorded, looping
 from shielded_robots import ALWAYS, PERIOD, PUSH, STILL, config, last
 
 from lerobot_latentsafe._compat import BETWEEN, RECORDING
@@ -56,22 +57,6 @@ def test_a_slack_that_is_none_is_refused(trained, slack_s):
         config(trained, slack_s=slack_s)
 
 
-def looping(where, call, **variables):
-    """Let something be called by a loop of this name and with these variables, as by LeRobot's."""
-    module, function = where
-    space = {"__name__": module}
-    exec(f"def {function}(call, {', '.join(variables)}):\n    return call()", space)
-    return space[function](call, **variables)
-
-
-class Recorded:
-    """A dataset that is being recorded, as far as loops tell."""
-
-    def __init__(self, episode):
-        self.num_episodes = episode
-
-
-RECORD_LOOP, POLICY_LOOP = RECORDING
 RESETS = {
     "reset of lerobot-record": (RECORD_LOOP, {"dataset": None, "start_episode_t": 5.0}),
     **{name: ((module, name), {}) for module, name in sorted(BETWEEN)},

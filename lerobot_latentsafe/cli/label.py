@@ -124,9 +124,9 @@ class CheckLabels:
         """Write the page, and print the worst."""
         model, frames = load_filter(self.policy.path).model, self.dataset.frames()
         store = LabelStore(frames.root, frames.meta.repo_id, [self.specification])
-        margins, without = {}, {}
-        for episode, margin in episode_margins(model, frames):
-            (without if isinstance(margin, str) else margins)[episode] = margin
+        judged = dict(episode_margins(model, frames))
+        margins = {episode: margin for episode, margin in judged.items() if not isinstance(margin, str)}
+        without = {episode: why for episode, why in judged.items() if isinstance(why, str)}
         found = find_disagreements(store, self.specification, margins)
         for d in found[:20]:
             label = in_words(store.verdict(self.specification, d.episode).first, len(d.margin))

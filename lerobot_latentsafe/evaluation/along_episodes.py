@@ -75,7 +75,9 @@ def episode_margins(
     contract = Contract.read_sound(frames.meta)
     check_fit(model, frames, contract)
     for batch in _batches(frames, batch_size):
-        found = {episode: contract.broken[episode] for episode in batch if episode in contract.broken}
+        found: dict[int, np.ndarray | str] = {
+            episode: contract.broken[episode] for episode in batch if episode in contract.broken
+        }
         found |= _judged(model, frames, [episode for episode in batch if episode not in found])
         yield from ((episode, found[episode]) for episode in batch)
 

@@ -22,8 +22,9 @@ from lerobot_latentsafe.units import TrainedOn
 
 BEFORE, AFTER_S = 12, 2.0
 """Healthy frames before a fault, and seconds for which it lasts at most."""
-MOVES = 0.1
-"""A frozen camera can be told where some joint that it sees moves by this share of its range meanwhile."""
+MOVES, MOVES_FAR = 0.1, 0.3
+"""A camera freezes where some joint that it sees moves by this share of its range meanwhile; and all that is seen where
+any joint moves by that share."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,8 @@ def replayed(shield: Shield, episode: Recorded) -> Iterator[FilterDecision]:
 
 def alarms(policy: LatentSafePolicy, episodes: Iterator[Recorded]) -> dict[str, object]:
     """How often something is found wrong with healthy episodes, and why; and what the checks of a tick cost."""
-    shield, reasons, took = Shield(policy.model, clock=standing_still), Counter[str](), []
+    shield, reasons = Shield(policy.model, clock=standing_still), Counter[str]()
+    took: list[float] = []
     n_episodes = 0
     for episode in episodes:
         n_episodes += 1
@@ -182,7 +184,7 @@ def _frozen(episode: Recorded, at: int, data: TrainedOn, rng: np.random.Generato
 def _frozen_whole(episode: Recorded, at: int, data: TrainedOn, rng: np.random.Generator) -> Recorded | None:
     """All that is seen, state and pictures, while commands go on."""
     went = (episode.state[at:] - episode.state[at]).abs().amax(0).numpy()
-    if not (went > MOVES * np.subtract(data.state_high, data.state_low)).any():
+    if not (went > MOVES_FAR * np.subtract(data.state_high, data.state_low)).any():
         return None
     state = torch.cat([episode.state[:at], episode.state[at].expand_as(episode.state[at:])])
     pictures = {
@@ -218,7 +220,7 @@ FAULTS: dict[str, Injected] = {
 def caught(
     policy: LatentSafePolicy, episodes: list[Recorded], fault: str, n: int, seed: int = 0
 ) -> dict[str, int | float | None]:
-    """How many of n faults at random places the guard notices while they last, and after how many ticks."""
+    """How many of n faults at random places do not get to the robot, and after how many ticks that begins."""
     rng, data = np.random.default_rng(seed), policy.config.trained_on
     shield, after, tried = Shield(policy.model, clock=standing_still), [], 0
     for _ in range(100 * n):
@@ -231,13 +233,19 @@ def caught(
         if broken is None:
             continue
         tried += 1
-        first = next((t for t, d in enumerate(replayed(shield, broken)) if t >= BEFORE and d.intervened.item()), None)
+        decisions = enumerate(replayed(shield, broken))
+        first = next((t for t, decision in decisions if t >= BEFORE and _noticed(decision)), None)
         if first is not None:
             after.append(first - BEFORE)
     return {
         "injected": tried, "caught": len(after), "ticks_median": float(np.median(after)) if after else None,
         "ticks_most": max(after, default=None),
     }  # fmt: skip
+
+
+def _noticed(decision: FilterDecision) -> bool:
+    """Whether the proposal is not what is executed: it was stopped, or clipped into the range of the data."""
+    return bool(decision.intervened) or not torch.equal(decision.action, decision.proposed)
 
 
 def load_recorded(root: Path, episodes: list[int], cameras: list[str]) -> list[Recorded]:

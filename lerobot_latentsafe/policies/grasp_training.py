@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from lerobot.datasets.dataset_tools import add_features
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.policies.factory import make_pre_post_processors
 from lerobot.processor import DeviceProcessorStep
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from safetensors import safe_open
@@ -25,6 +24,7 @@ from lerobot_latentsafe.encoders.perception import PerceptionConfig
 from lerobot_latentsafe.policies.grasp_prediction import GraspPredictionStep, GraspPredictor, TwoValuedStep
 from lerobot_latentsafe.runtime.checkpoint import read_config
 from lerobot_latentsafe.runtime.files import refuse_existing, replacing_folder
+from lerobot_latentsafe.runtime.processors import load_processors
 
 SWITCH = "gripper.pos"
 """The command whose falling is aimed at."""
@@ -164,8 +164,7 @@ def let_see(checkpoint: str | Path, cache_root: str | Path, seen: str | Path, ou
         config.robot_state_feature.shape[0], config.env_state_feature.shape[0] // 2,
     )  # fmt: skip
     step.load_state_dict(load_file(Path(seen) / AIM))
-    elsewhere = {"device_processor": {"device": "cpu"}}
-    pre, post = make_pre_post_processors(config, pretrained_path=checkpoint, preprocessor_overrides=elsewhere)
+    pre, post = load_processors(config, checkpoint, "cpu")
     # After images are batched and on the device, before anything is normalised.
     at = next(i for i, s in enumerate(pre.steps) if isinstance(s, DeviceProcessorStep)) + 1
     pre.steps.insert(at, step)

@@ -128,14 +128,14 @@ def read_json(file: Path) -> dict[str, Any]:
     Raises:
         CheckpointError: missing, too large, or no JSON object; NaN is none.
     """
+    if not file.is_file():
+        raise CheckpointError(f"{file} is missing; {AGAIN}")
     try:
         if file.stat().st_size > LARGEST_JSON:
             raise ValueError(f"{file.stat().st_size} bytes, at most {LARGEST_JSON} are read")
         found = json.loads(file.read_text(encoding="utf-8"), parse_constant=_constant)
         if not isinstance(found, dict):
             raise ValueError(f"a {type(found).__name__}, expected an object")
-    except FileNotFoundError as e:
-        raise CheckpointError(f"{file} is missing; {AGAIN}") from e
     except (OSError, ValueError, RecursionError) as e:
         raise CheckpointError(f"{file} is not readable ({e}); {AGAIN}") from e
     return found
@@ -261,8 +261,7 @@ def check_sealed(folder: Path, entries: Sequence[str]) -> None:
             added to the base policy.
     """
     file, record = folder / WEIGHTS, folder / INTEGRITY
-    if not file.exists() or not record.exists():
-        missing = [f.name for f in (file, record) if not f.exists()]
+    if missing := [f.name for f in (file, record) if not f.is_file()]:
         raise CheckpointError(f"{folder} lacks {', '.join(missing)}; expected a folder written by save_pretrained")
     expected = _read_record(record, entries)
     if file.stat().st_size != expected["bytes"]:
@@ -289,9 +288,10 @@ def _read_record(record: Path, entries: Sequence[str]) -> dict[str, Any]:
     """The record of a seal, of the present or of an older version, which had no `files`."""
     found = {"entries": list(entries), "files": None, **read_json(record)}
     types = {"sha256": str, "bytes": int, "config_sha256": str, "entries": list, "files": dict | None}
-    wrong = [name for name, kind in types.items() if not isinstance(found.get(name), kind)]
-    if wrong or not {*map(str, entries)} <= {*map(str, found["entries"])}:
-        lacking = wrong or sorted({*map(str, entries)} - {*map(str, found["entries"])})
+    lacking = [name for name, kind in types.items() if not isinstance(found.get(name), kind)]
+    if not lacking:
+        lacking = [name for name in entries if name not in found["entries"]]
+    if lacking or not all(isinstance(name, str) for name in found["entries"]):
         raise CheckpointError(f"{record} is not readable (it says nothing of {', '.join(lacking)}); {AGAIN}")
     return found
 

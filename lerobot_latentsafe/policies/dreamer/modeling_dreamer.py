@@ -16,12 +16,10 @@ from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
 from lerobot_latentsafe.policies.dreamer.behavior import Actor, ReturnRange, TwoHotHead, imagine, lambda_returns
 from lerobot_latentsafe.policies.dreamer.configuration_dreamer import LatentSafeDreamerConfig
 from lerobot_latentsafe.runtime.checkpoint import (
-    CONFIG,
     CheckpointError,
     fitting_weights,
     named_by,
     read_config,
-    read_json,
     resolve_checkpoint,
 )
 from lerobot_latentsafe.runtime.hub import save_policy
@@ -209,7 +207,7 @@ def stored_world_model(folder: Path, config: LatentSafeDreamerConfig) -> str | N
 
 def _found_world_model(folder: Path, path: str | None) -> str | None:
     """Where it is on this machine: a user may choose any, a folder's own configuration names what it may name."""
-    if path is None or path != read_json(folder / CONFIG).get("world_model_path"):
+    if path is None or path != getattr(read_config(folder), "world_model_path", None):
         return path
     return str(named_by(folder, path, f"Put it into {folder / WORLD_MODEL_FOLDER}, or give --policy.world_model_path"))
 

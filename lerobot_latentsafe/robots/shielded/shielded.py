@@ -1,5 +1,6 @@
 """Any LeRobot robot behind a latent safety filter, for whatever drives it: a person, a replay, a policy far away."""
 
+import copy
 import logging
 import math
 import threading
@@ -175,7 +176,7 @@ class LatentSafeShielded(WrappedRobot):
             return self._bounded(numbers), None
         decision = self._judge(numbers) if known else None
         if decision is None:
-            return self._hold(numbers), None
+            return self._hold("what the filter could not judge" if known else _kind(numbers)), None
         if missing:
             self._say_once(f"the action lacks {', '.join(sorted(missing))}: it counts as not finite")
         return self._carry_out(decision, numbers) | self._others(numbers), decision
@@ -253,15 +254,15 @@ class LatentSafeShielded(WrappedRobot):
                 low, high = self._trained_on.motion_ranges[name]
                 start = self._moved.get(name, pose[command.of_state])
                 if not math.isfinite(start):
-                    return self._hold(numbers)
+                    return self._hold(f"{_kind(numbers)} from a place that is not known")
                 bounded[name] = self._moved[name] = min(max(numbers[name], start + low), start + high)
         return bounded
 
-    def _hold(self, numbers: dict[str, float]) -> dict[str, float]:
-        """Instead of a command on which there can be no decision: stay."""
+    def _hold(self, instead: str) -> dict[str, float]:
+        """Stay, instead of a command on which there can be no decision."""
         self._say_once(
-            f"the filter cannot judge a command of {', '.join(numbers) or 'nothing'}: the robot holds still. "
-            "--robot.unfiltered_moves=true lets moves of other names pass unfiltered"
+            f"the robot holds still, instead of {instead}. --robot.unfiltered_moves=true lets moves of other names "
+            "than the filter's pass unfiltered"
         )
         self._unjudged = True
         if self._observation is None:
@@ -293,7 +294,7 @@ class LatentSafeShielded(WrappedRobot):
     def _execute(self, told: Any) -> Any:
         """Tell the inner robot; returns what was executed, as far as it is known."""
         try:
-            reported = self.inner.send_action(told)
+            reported = self.inner.send_action(copy.copy(told))
         except Exception as e:
             self._unsent += 1
             if self._unsent >= MAX_FAILURES:
@@ -363,6 +364,10 @@ class LatentSafeShielded(WrappedRobot):
         self._recorded, self._unjudged = False, False
         self._moved: dict[str, float] = {}
         self._said: set[str] = set()
+
+
+def _kind(numbers: dict[str, float]) -> str:
+    return f"a command of {', '.join(numbers) or 'nothing'}"
 
 
 _connected: list[LatentSafeShielded] = []
