@@ -160,7 +160,7 @@ def _tick(robot: LatentSafeShielded, clock: Clock, t: int, fault: str | None, co
         robot.get_observation()
         robot.send_action(ACTIONS[fault](wanted) if fault in ACTIONS else wanted)
     decision = robot._decision if robot._untaken and robot._untaken[1] is not None else None
-    reason = Reason(decision.reason.item()) if decision is not None else None
+    reason = Reason(int(decision.reason.item())) if decision is not None else None
     told = np.array([arm.told.get(name, math.nan) for name in NAMES]) if arm.told else before
     if not (np.isfinite(told).all() and np.abs(told - before).max() <= STEP + 1e-3):
         count["out of range"] += 1
