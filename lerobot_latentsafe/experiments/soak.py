@@ -42,6 +42,11 @@ class Clock:
     def __call__(self) -> float:
         return self.now
 
+    def after(self, seconds: float, value: Any) -> Any:
+        """A value that took so long."""
+        self.now += seconds
+        return value
+
 
 def _shows(name: str, change: Callable[[Any], Any]) -> Callable[[dict], dict]:
     """A robot that shows something else; ... leaves it out."""
@@ -116,7 +121,8 @@ def soak(n_ticks: int, seed: int = 0) -> dict[str, Any]:
         files and the threads.
     """
     logging.disable(logging.CRITICAL)
-    draw, clock, count = random.Random(seed), Clock(), Counter()
+    count: Counter[str] = Counter()
+    draw, clock = random.Random(seed), Clock()
     usage: dict[str, list[float]] = {"memory_mb": [], "open_files": [], "threads": []}
     with TemporaryDirectory() as folder:
         save_policy(stand_in_filter(), Path(folder))
@@ -154,7 +160,7 @@ def _tick(robot: LatentSafeShielded, clock: Clock, t: int, fault: str | None, co
     elif fault == "a robot that is not read":
         altered = _fails
     elif fault == "a reading that takes a second":
-        altered = lambda: (read(), setattr(clock, "now", clock.now + 0.9))[0]  # noqa: E731
+        altered = lambda: clock.after(0.9, read())  # noqa: E731
     wanted = _wanted(t, before)
     with _reads(arm, altered), BROKEN[fault](shield) if fault in BROKEN else nullcontext():
         robot.get_observation()

@@ -104,9 +104,9 @@ def stand_in_filter() -> LatentSafePolicy:
         displacement_high=step, displacement_scale=step, state_low=[-x for x in far], state_high=far, state_step=step,
         state_mean=[0.0] * n, state_std=[10.0] * n,
     )  # fmt: skip
-    sizes = dict(deterministic=16, stochastic=4, hidden=16, units=16, state_units=8, clip_length=8)
     config = LatentSafeConfig(
-        world_model=RSSMConfig(**sizes), reachability=ReachabilityConfig(critic_hidden=(16,), actor_hidden=(16,)),
+        world_model=RSSMConfig(deterministic=16, stochastic=4, hidden=16, units=16, state_units=8, clip_length=8),
+        reachability=ReachabilityConfig(critic_hidden=(16,), actor_hidden=(16,)),
         law=LawConfig(lookahead=0, history_frames=8), trained_on=trained_on, device="cpu", push_to_hub=False,
         input_features={
             key: PolicyFeature(FeatureType.VISUAL, (3, SIDE, SIDE)),
