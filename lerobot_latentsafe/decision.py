@@ -271,4 +271,4 @@ def by_checks_alone(
 
 def first_fault(fault: Tensor, where: Tensor, reason: Reason) -> Tensor:
     """Set a reason on rows (B,) that have none yet."""
-    return torch.where((fault == Reason.PASSED) & where, torch.full_like(fault, reason), fault)
+    return torch.where((fault == Reason.PASSED) & where, int(reason), fault)

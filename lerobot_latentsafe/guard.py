@@ -17,7 +17,7 @@ from torch import Tensor
 
 from lerobot_latentsafe.decision import Reason, first_fault
 from lerobot_latentsafe.encoders.pictures import check_proportions
-from lerobot_latentsafe.looks import Cameras, Response
+from lerobot_latentsafe.looks import SIDE, Cameras, Response
 from lerobot_latentsafe.safety_model import SafetyModel
 from lerobot_latentsafe.units import AT_REST, Units
 
@@ -176,15 +176,18 @@ class Guard:
             finite = finite & numbers
         fault = first_fault(fault, ~finite, Reason.OBSERVATION_NOT_FINITE)
         fault = first_fault(fault, ~believed, Reason.OBSERVATION_OUT_OF_RANGE)
-        fault = self._compare(pictures, state, fault)
+        images = {key: self.model.images(picture).clamp(0, 1) for key, picture in pictures.items()}
+        fault = self._compare(pictures, images, state, fault)
         self.response.see(state, self.model.units.unknown(n) if self.told is None else self.told)
         self._begun = True
-        return Seen({key: self.model.images(picture).clamp(0, 1) for key, picture in pictures.items()}, state, fault)
+        return Seen(images, state, fault)
 
-    def _compare(self, pictures: dict[str, Tensor], state: Tensor, fault: Tensor) -> Tensor:
+    def _compare(self, pictures: dict[str, Tensor], images: dict[str, Tensor], state: Tensor, fault: Tensor) -> Tensor:
         """What is wrong beside the data's pictures, and beside what was shown and told before: faults (B,)."""
         if pictures:
-            dead, unfamiliar, thumbnails = self.cameras.check(pictures)
+            sides = {key: min(picture.shape[-2:]) for key, picture in pictures.items()}
+            whole = self.model.config.world_model.image_size % SIDE == 0  # then what is averaged once serves here, too
+            dead, unfamiliar, thumbnails = self.cameras.check(images if whole else pictures, sides)
             old = self.cameras.repeats(thumbnails, self.model.units.normalise_state(state))
             if (dead | unfamiliar).any():
                 self.say_once("; ".join(self.cameras.wrong))

@@ -228,11 +228,12 @@ class Cameras:
         self._repeats: Tensor | int = 0
         self._checked: tuple[Tensor, ...] = ()
 
-    def check(self, pictures: dict[str, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    def check(self, pictures: dict[str, Tensor], sides: dict[str, int] | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """Which robots have a camera that shows nothing, and which one that shows what the dataset never does.
 
         Args:
             pictures: camera key -> (B, C, H, W) in [0, 1]; pixels that are no numbers alarm nothing here.
+            sides: the shorter side of what the camera showed, pixels, if these pictures were averaged of it.
 
         Returns:
             dead, unfamiliar: bool (B,); and thumbnails (B, cameras, 3, THUMBNAIL, THUMBNAIL) for `repeats`.
@@ -243,7 +244,8 @@ class Cameras:
         dead = (contrast(picture) < self._least.to(small.device)).any(-1)
         low, high = self._detail.to(small.device).unbind(-1)
         fine = detail(small)
-        tiny = [min(pictures[key].shape[-2:]) < size for key, size in zip(self.keys, self._sizes)]
+        sides = sides or {key: min(picture.shape[-2:]) for key, picture in pictures.items()}
+        tiny = [sides[key] < size for key, size in zip(self.keys, self._sizes)]
         blurred = (fine < low) | torch.tensor(tiny, device=small.device)
         away = (picture - self._mean.to(small.device)).square().mean((-3, -2, -1)).sqrt()
         strange = blurred | (fine > high) | (away > self._furthest.to(small.device))

@@ -82,7 +82,7 @@ class LatentSafePolicy(PreTrainedPolicy):
         self._base_lost = False
         self._in_time = TimeLimit(self.model.device.type)
         self.shield = Shield(self.model)
-        if config.base_policy_path:
+        if config.base_policy_path and not self.model.lacks_weights:
             self.attach(config.base_policy_path)
 
     # -- training (stage 1) ---

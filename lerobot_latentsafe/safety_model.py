@@ -258,4 +258,5 @@ class SafetyModel(nn.Module):
 
 
 def _has_loaded(model: SafetyModel, incompatible: Any) -> None:
-    model.lacks_weights = False
+    if not incompatible.missing_keys:
+        model.lacks_weights = False
