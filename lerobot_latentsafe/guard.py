@@ -132,13 +132,15 @@ class Guard:
         moving: bool (B, A), whether what each target is of has moved since the last tick.
         stay: (B, A) in robot units, what would have been to stay at the last tick.
         holding: bool (B, A), commands that were told to stay.
+        begun: whether an observation of this robot has been seen, so that a foreign one is a fault and no mistake of
+            whoever set it up.
     """
 
     def __init__(self, model: SafetyModel):
         self.model, units = model, model.units
         self.cameras = Cameras(model.world_model.image_keys, model.config.trained_on.looks)
         self.response = Response(AT_REST * units.state_step, units.adds_up, units.furthest_unanswered)
-        self._begun = False
+        self.begun, self._rows = False, 1
         self._said: set[tuple[str, str]] = set()
         self.reset()
 
@@ -179,7 +181,7 @@ class Guard:
         images = {key: self.model.images(picture).clamp(0, 1) for key, picture in pictures.items()}
         fault = self._compare(pictures, images, state, fault)
         self.response.see(state, self.model.units.unknown(n) if self.told is None else self.told)
-        self._begun = True
+        self.begun, self._rows = True, n
         return Seen(images, state, fault)
 
     def _compare(self, pictures: dict[str, Tensor], images: dict[str, Tensor], state: Tensor, fault: Tensor) -> Tensor:
@@ -233,7 +235,7 @@ class Guard:
         missing = [key for key in inputs if observation.get(key) is None]
         wrong = {key: self._wrong_shape(key, observation[key]) for key in inputs if key not in missing}
         rows = {key: len(observation[key]) for key, why in wrong.items() if why is None}
-        n = len(self.pose) if self.pose is not None else next(iter(rows.values()), None)
+        n = len(self.pose) if self.pose is not None else next(iter(rows.values()), self._rows)
         if self.pose is not None and rows and set(rows.values()).isdisjoint({n}):
             raise ValueError(
                 f"the batch went from {n} to {next(iter(rows.values()))} robots within an episode; "
@@ -242,10 +244,10 @@ class Guard:
         for key, count in rows.items():
             if count != n:
                 wrong[key] = f"{key} is of {count} robots, expected {n}"
-        if missing and (not self._begun or n is None):
+        if missing and not self.begun:
             raise KeyError(self._lacks(missing, observation))
         explained = [why for why in wrong.values() if why]
-        if explained and (not self._begun or n is None):
+        if explained and not self.begun:
             raise ValueError(explained[0])
         for why in [*([self._lacks(missing, observation)] if missing else []), *explained]:
             self.say_once(why)

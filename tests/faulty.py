@@ -93,10 +93,10 @@ def car_bench(folder, **law) -> Bench:
     return Bench(policy, _cars, torch.tensor([[0.5, 1.0]] * 3), torch.tensor([[0.0, 1.0]] * 3))
 
 
-def franka_bench(folder) -> Bench:
+def franka_bench(folder, **limits) -> Bench:
     """An arm of two cameras, of delta commands and a gripper."""
     n = 14
-    ranges = dict(state_low=[-1.0] * n, state_high=[1.0] * n, state_step=[0.1] * n)
+    ranges = dict(state_low=[-1.0] * n, state_high=[1.0] * n, state_step=[0.1] * n, **limits)
     tiny.save_franka_filter(folder, **{f"trained_on_{name}": value for name, value in ranges.items()})
     policy = LatentSafePolicy.from_pretrained(folder).eval()
     wanted = torch.tensor([[0.01, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]])

@@ -63,6 +63,7 @@ def test_one_kind_of_episode_is_not_enough(rows):
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("which", [0, 1], ids=["failing", "safe"])
+@pytest.mark.fault("N05", "calibrate on values that are NaN", "Refused, with how many")
 def test_a_value_that_is_not_finite_is_no_warning_and_no_silence(value, which):
     rows = [FAILING, safe(0.2, 0.9), safe(0.5)]
     rows[which] = {**rows[which], "value": np.append(rows[which]["value"][:-1], value)}
@@ -77,6 +78,7 @@ NONSENSE = [
 
 
 @pytest.mark.parametrize("options, message", NONSENSE)
+@pytest.mark.fault("N05", "calibrate with nonsensical options", "Refused, with what was expected")
 def test_options_that_mean_nothing_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         calibrate([FAILING, safe(1.0)], **options)

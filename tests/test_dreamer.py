@@ -169,6 +169,12 @@ def test_a_run_killed_while_it_writes_ends_as_one_that_was_not(trained, tmp_path
     same_run(tmp_path / "run", trained)
 
 
+@pytest.mark.fault(
+    "K11", "options.json of train-dreamer is torn by a kill", "That one file is to be removed; the run goes on"
+)
+@pytest.mark.fault(
+    "K11", "options.json of train-dreamer is torn by a kill", "That one file is to be removed; the run goes on"
+)
 def test_a_note_torn_by_a_kill_is_told_and_the_rest_goes_on(trained, tmp_path):
     folder = shutil.copytree(trained, tmp_path / "run")
     (folder / "options.json").write_text("")
@@ -178,6 +184,7 @@ def test_a_note_torn_by_a_kill_is_told_and_the_rest_goes_on(trained, tmp_path):
     assert DreamerTraining(tiny.dreamer_options(folder)).step == 7
 
 
+@pytest.mark.fault("K14", "two train-dreamer write one folder", "The second is refused (`FolderInUseError`)")
 def test_two_at_once_are_told_apart(tmp_path):
     entered, left = threading.Event(), threading.Event()
 

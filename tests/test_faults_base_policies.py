@@ -3,7 +3,6 @@
 import math
 import threading
 from collections import deque
-from pathlib import Path
 from types import SimpleNamespace
 
 import faulty
@@ -326,9 +325,23 @@ def test_actions_in_another_order_are_put_in_order(benches, caplog):
     assert "in another order" in caplog.text
 
 
-@faulty.fault(
-    "B21", "its actions are in another order, and nobody knows its data", "Documented: [Known limits](limits.md)"
-)
-def test_an_order_that_nobody_knows_is_a_documented_limit():
-    limits = (Path(__file__).parents[1] / "docs" / "limits.md").read_text()
-    assert "Names of a base policy's numbers are known only where its dataset is" in limits
+# -- what never changes ---
+
+
+@pytest.fixture(scope="module")
+def watchful(tmp_path_factory):
+    """An arm of two cameras whose data tell how far commands go before the state answers."""
+    return faulty.franka_bench(tmp_path_factory.mktemp("watchful") / "filter", unanswered=[0.01] * 7)
+
+
+@faulty.fault("B20", "the very same observation at every tick", "The robot goes no further: `OBSERVATION_STALE`")
+@pytest.mark.parametrize("through", ["policy", "shield"])
+def test_a_robot_whose_observation_never_changes_goes_no_further(watchful, through):
+    watchful.begin()
+    policy, seen, reasons = watchful.policy, watchful.see(0), []
+    policy._base = [BasePolicy(Policy(watchful.wanted), Pipeline(), Pipeline(), origin=UNKNOWN)]
+    for _ in range(30):
+        decision = policy.decide(seen) if through == "policy" else watchful.shield(seen, watchful.wanted)
+        reasons.append(decision.reason.item())
+    assert reasons[0] == Reason.PASSED and set(reasons[10:]) == {Reason.OBSERVATION_STALE}
+    watchful.assert_stays(decision)

@@ -124,6 +124,7 @@ DISARMED = [
     row("S60", "epsilon is NaN", math.nan, None, outcome="Refused (`ValueError`), with what was expected"),
     row("S60", "epsilon is -2 or -infinity", -2.0, NEVER, outcome=SHOUTED),
     row("S60", "epsilon is -2 or -infinity", -math.inf, NEVER, outcome=SHOUTED),
+    row("C16", "config.json says that epsilon is -1e9", -1e9, NEVER, outcome=SHOUTED),
     row("S60", "epsilon is 2 or infinity", 2.0, ALWAYS, outcome=SHOUTED),
     row("S60", "epsilon is 2 or infinity", math.inf, ALWAYS, outcome=SHOUTED),
 ]

@@ -196,6 +196,7 @@ def test_build_killed_at_any_step_ends_as_one_that_was_not(dataset_root, tmp_pat
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cut", "whole"]
 
 
+@pytest.mark.fault("D01", "the disk is full when a cache is built", "A message, before any work")
 def test_a_full_disk_is_an_error_before_any_frame_is_decoded(dataset_root, tmp_path, monkeypatch):
     """Writing to a page of a memory map that has no room on the disk would kill the process."""
 

@@ -83,6 +83,20 @@ FAULTS = {
 
 @pytest.mark.parametrize(("name", "broken", "message"), FAULTS.values(), ids=FAULTS)
 @pytest.mark.parametrize("noticed_by", ["an action", "an observation", "the watchdog"])
+@pytest.mark.fault("F01", "a measured position is NaN", "The arm stops until it is connected anew (`ArmFaultError`)")
+@pytest.mark.fault(
+    "F03", "the driver raises in the stream thread", "The arm stops until it is connected anew (`ArmFaultError`)"
+)
+@pytest.mark.fault(
+    "F04", "the driver raises in the watchdog", "The arm stops until it is connected anew (`ArmFaultError`)"
+)
+@pytest.mark.fault("F01", "a measured position is NaN", "The arm stops until it is connected anew (`ArmFaultError`)")
+@pytest.mark.fault(
+    "F03", "the driver raises in the stream thread", "The arm stops until it is connected anew (`ArmFaultError`)"
+)
+@pytest.mark.fault(
+    "F04", "the driver raises in the watchdog", "The arm stops until it is connected anew (`ArmFaultError`)"
+)
 def test_a_fault_of_the_arm_stops_it_until_it_is_connected_anew(robot, clock, name, broken, message, noticed_by):
     hangs, act = broken == FOREVER.wait, lambda: robot.send_action(STILL | {"delta_x.pos": 0.01})
     act()
@@ -107,6 +121,7 @@ def test_a_fault_of_the_arm_stops_it_until_it_is_connected_anew(robot, clock, na
     assert act()["delta_x.pos"] == pytest.approx(0.01)
 
 
+@pytest.mark.fault("F01", "the pose that is to be streamed is NaN", "It is not sent (`ArmFaultError`)")
 def test_nothing_that_is_not_finite_is_streamed(robot):
     """Whatever becomes of the commanded pose inside."""
     robot._stream.set_target(Pose(START * NAN, DOWN))
@@ -116,6 +131,7 @@ def test_nothing_that_is_not_finite_is_streamed(robot):
     assert np.isfinite(robot.driver.tracked).all()
 
 
+@pytest.mark.fault("F05", "the arm does not answer the watchdog", "Nobody waits for it (`ArmFaultError`)")
 def test_nobody_waits_for_an_arm_that_does_not_answer_the_watchdog(robot, clock):
     asked, answered = threading.Event(), threading.Event()
     robot.driver.state = lambda: asked.set() or answered.wait(60.0)
@@ -144,6 +160,12 @@ def test_an_action_that_comes_while_the_watchdog_asks_is_followed(robot, clock):
     assert robot._stream.target() is wanted and robot._stream.error is None
 
 
+@pytest.mark.fault(
+    "F06b", "recovering fails, then the arm answers again", "Refused until it is connected anew (`ArmFaultError`)"
+)
+@pytest.mark.fault(
+    "F06b", "recovering fails, then the arm answers again", "Refused until it is connected anew (`ArmFaultError`)"
+)
 def test_an_arm_that_does_not_recover_is_refused_until_it_is_connected_anew(robot):
     robot.driver.reflex, robot.driver.recover = True, failing(FrankaError("release the user stop"))
     with pytest.raises(FrankaError, match="release the user stop"):
@@ -167,6 +189,7 @@ def test_an_arm_that_does_not_stop_is_told(robot, caplog):
 
 
 @pytest.mark.parametrize("rate", [15, 60, 200])
+@pytest.mark.fault("F11", "a loop four times too fast", "The arm goes no faster than its limit")
 def test_the_speed_limit_is_by_time_not_by_action(robot, step, rate):
     sent = [step(robot.config.fps / rate, delta_y=0.02, delta_rz=0.13) for _ in range(rate // 5)]
     assert sum(action["delta_y.pos"] for action in sent) <= MAX_SPEED * (0.2 + KEPT / 15) + 1e-9
@@ -203,6 +226,7 @@ def test_a_clock_that_goes_back_gives_no_speed(robot, clock, moment):
 
 
 @pytest.mark.parametrize("outside", [(0.85, 0.0, 0.30), (0.45, 0.0, 0.01), (0.2, -0.5, 0.6)])
+@pytest.mark.fault("F15", "the arm was guided out of the workspace", "It does not jump back")
 def test_an_arm_that_was_led_out_of_the_workspace_does_not_jump(robot, step, outside):
     robot.driver.position = np.array(outside)
     robot.driver.blocked = True
@@ -220,6 +244,7 @@ def test_an_arm_that_was_led_out_of_the_workspace_does_not_jump(robot, step, out
     assert all(back[f"delta_{axis}.pos"] * d > 0 for axis, d in zip("xyz", away) if d)
 
 
+@pytest.mark.fault("F09", "the gripper does not move", "It is told once more, and that is said")
 def test_a_gripper_that_stays_is_told_again_once(robot, step, caplog):
     told = lambda: [call for call in robot.driver.calls if call.startswith("gripper")]  # noqa: E731
     robot.driver.move_gripper = lambda width: robot.driver.calls.append(f"gripper {width:.3f}")
@@ -278,6 +303,7 @@ HALF_WAY = {
 
 
 @pytest.mark.parametrize("break_it", HALF_WAY.values(), ids=HALF_WAY)
+@pytest.mark.fault("F10", "connecting fails half way", "Cameras are closed, and it can be connected again")
 def test_connecting_that_ends_half_way_leaves_nothing_open(clock, break_it):
     robot = unhurried(make())
     robot.cameras = {"front": Camera(), "wrist": Camera()}

@@ -183,6 +183,8 @@ def test_push_that_breaks_off_is_a_clear_error(hub, policy, monkeypatch):
 
 
 @pytest.mark.parametrize("fault", ["500", "403", "cut"])
+@pytest.mark.fault("H02", "the Hub answers 500 when weights are uploaded", "A message; the same command goes on")
+@pytest.mark.fault("H04", "the connection is cut when weights are uploaded", "A message; the same command goes on")
 def test_weights_that_do_not_arrive_are_pushed_by_the_same_command(hub, tiny_filter, monkeypatch, fault):
     from lerobot_latentsafe.cli import main
 
@@ -289,6 +291,8 @@ def rate(**changes):
         (json.dumps({"a": {"overridden_share": 2, **json.loads(rate())["weak"]}}), "expected a share"),
     ],
 )  # fmt: skip
+@pytest.mark.fault("X06", "a results file holds odd entries", "Refused, with what was expected")
+@pytest.mark.fault("X07", "a results file with k > n, NaN or strings", "Refused, with what was expected")
 def test_results_without_rates_are_refused(tmp_path, content, words):
     from lerobot_latentsafe.model_card import measured
 
@@ -297,6 +301,7 @@ def test_results_without_rates_are_refused(tmp_path, content, words):
         measured(tmp_path / "results.json", "reachability")
 
 
+@pytest.mark.fault("X07", "a results file with n = 0", "The card says: not measured")
 def test_a_result_of_no_rollouts_says_so(tmp_path):
     from lerobot_latentsafe.model_card import measured
 
@@ -313,6 +318,8 @@ HOSTILE = [
 
 
 @pytest.mark.parametrize("name", HOSTILE)
+@pytest.mark.fault("X04", "names of data, tasks and files hold HTML or Markdown", "They are text in the card")
+@pytest.mark.fault("X05", "a card is shown by a viewer that keeps HTML", "No script runs")
 def test_names_are_text_in_a_card(policy, name):
     """Rendered with HTML kept, as some viewers do, where the Hub would take it out."""
     from markdown_it import MarkdownIt

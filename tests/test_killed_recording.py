@@ -156,6 +156,12 @@ POINTS = [
 
 
 @pytest.mark.parametrize(("where", "nth", "word", "saved"), POINTS)
+@pytest.mark.fault(
+    "K31", "record is killed in the third episode", "LeRobot reads the saved episodes; --resume=true goes on"
+)
+@pytest.mark.fault(
+    "K31", "record is killed in the third episode", "LeRobot reads the saved episodes; --resume=true goes on"
+)
 def test_a_killed_recording_holds_what_was_saved_and_goes_on(tmp_path, whole, where, nth, word, saved):
     root = tmp_path / "data"
     killed(lambda: record(root, EPISODES), where, nth, word)
@@ -175,6 +181,7 @@ def test_a_killed_recording_holds_what_was_saved_and_goes_on(tmp_path, whole, wh
     ("where", "nth"),
     [(f"{WRITER}.add_frame", FRAMES + 2), (f"{WRITER}._save_episode_video", 2), (f"{OURS}.complete", 2)],
 )
+@pytest.mark.fault("K37", "record --resume=true is killed", "Finished episodes stay readable; it goes on")
 def test_finished_episodes_outlive_a_kill_of_the_recording_that_goes_on(tmp_path, how, where, nth):
     root = tmp_path / "data"
     record(root, 1, **how)
@@ -230,6 +237,12 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("fault", BROKEN)
+@pytest.mark.fault(
+    "K36", "the journal of decisions is deleted, torn or another's", "Refused with the remedy; nothing is changed"
+)
+@pytest.mark.fault(
+    "K36", "the journal of decisions is deleted, torn or another's", "Refused with the remedy; nothing is changed"
+)
 def test_a_recording_does_not_go_on_without_its_decisions(tmp_path, fault):
     root, (break_it, words) = tmp_path / "data", BROKEN[fault]
     record(root, 2)
@@ -316,6 +329,7 @@ def merge(root, output, *options):
     main(["merge-decisions", *given, *options])
 
 
+@pytest.mark.fault("K32", "decisions of the last episode are missing", "The others are merged, that one is named")
 def test_decisions_are_merged_with_the_episodes_that_have_them(tmp_path):
     root, output = tmp_path / "data", tmp_path / "merged"
     record(root, 2)

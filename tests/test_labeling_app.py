@@ -223,6 +223,7 @@ def test_fuzzed_addresses_and_bodies_touch_no_file(client, server, root, seed, m
     assert not opened and sorted(str(p) for p in root.rglob("*")) == before
 
 
+@pytest.mark.fault("L16", "--port is in use", "A message")
 def test_port_in_use_is_a_message():
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
@@ -236,6 +237,7 @@ def test_port_in_use_is_a_message():
     ["0.0.0.0", "::", "", "0", "0x0", "00", "0.0", "000.0.0.0", "0x0.0.0.0", "::0", "0:0:0:0:0:0:0:0",
      "::ffff:0.0.0.0", "::ffff:0:0", "224.0.0.1"],
 )  # fmt: skip
+@pytest.mark.fault("L16", "--host is an odd spelling of every interface", "Refused, with the remedy")
 def test_every_interface_at_once_is_refused(host):
     with pytest.raises(ValueError, match="SSH tunnel"):
         listen(host, 0)
@@ -268,6 +270,7 @@ def test_a_host_that_is_none_is_a_message(host, monkeypatch):
 
 
 @pytest.mark.parametrize("port", [-1, 70000, 2**40])
+@pytest.mark.fault("L16", "--port is 70000", "A message")
 def test_a_port_that_is_none_is_a_message(port):
     with pytest.raises(OSError, match="choose another --port"):
         listen("127.0.0.1", port)

@@ -161,6 +161,7 @@ def test_a_second_one_that_is_refused_does_not_break_a_save(store, root, monkeyp
     assert refused and FailureLabels.load(root, "spilled").failure.max() == 1
 
 
+@pytest.mark.fault("M29", "another process saves between reading and locking", "Its labels are read, none is lost")
 def test_what_another_process_saved_last_is_read(store, root):
     """Files are read when the folder is this process's, not before."""
     store.label("spilled", 3, 2, "ann")
@@ -195,6 +196,7 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
+@pytest.mark.fault("M29", "another program saves in spite of the lock", "Its labels are read, none is lost")
 def test_what_another_program_saved_in_spite_of_the_lock_is_never_overwritten(store, intruder, change, caplog):
     store.label("spilled", 3, 2, "ann")
     store.label("spilled", 6, 0, "ann")

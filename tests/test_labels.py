@@ -231,6 +231,12 @@ BROKEN = {
 
 
 @pytest.mark.parametrize(("changes", "message"), BROKEN.values(), ids=BROKEN)
+@pytest.mark.fault("M03", "a label file whose metadata are no JSON", "Refused (`LabelFileError`), and kept")
+@pytest.mark.fault("M05", "a label file that lacks its frames", "Refused (`LabelFileError`), and kept")
+@pytest.mark.fault("M06", "a label file of 'many' frames", "Refused (`LabelFileError`), and kept")
+@pytest.mark.fault("M16", "a label file whose index is of fractions", "Refused (`LabelFileError`), and kept")
+@pytest.mark.fault("M20", "a label file whose names are lists", "Refused (`LabelFileError`), and kept")
+@pytest.mark.fault("M21", "a label file whose times are words", "Refused (`LabelFileError`), and kept")
 def test_a_broken_label_file_says_what_is_wrong_and_stays(tmp_path, changes, message):
     path = sidecar(tmp_path, **changes)
     kept = path.read_bytes()

@@ -134,6 +134,14 @@ def test_also_by_a_filter_that_knows_no_looks(recorded, name):
 
 @pytest.mark.parametrize("key", [FRONT, WRIST])
 @pytest.mark.parametrize("name", STRANGE)
+@pytest.mark.fault("S14", "red and blue exchanged, where the data tell it", "The robot stays: `OBSERVATION_UNFAMILIAR`")
+@pytest.mark.fault(
+    "S15", "a camera upside down or mirrored, where the data tell it", "The robot stays: `OBSERVATION_UNFAMILIAR`"
+)
+@pytest.mark.fault("S14", "red and blue exchanged, where the data tell it", "The robot stays: `OBSERVATION_UNFAMILIAR`")
+@pytest.mark.fault(
+    "S15", "a camera upside down or mirrored, where the data tell it", "The robot stays: `OBSERVATION_UNFAMILIAR`"
+)
 def test_a_picture_that_the_data_never_show_is_told(recorded, looks, name, key):
     pictures, _, _ = recorded
     watch = cameras(looks)
@@ -143,6 +151,7 @@ def test_a_picture_that_the_data_never_show_is_told(recorded, looks, name, key):
         assert name in watch.wrong[0] and watch.wrong[0].startswith(key)
 
 
+@pytest.mark.fault("S12", "two cameras swapped, where the data tell it", "The robot stays: `OBSERVATION_UNFAMILIAR`")
 def test_exchanged_cameras_are_told_and_named(recorded, looks):
     pictures, _, _ = recorded
     watch = cameras(looks)
@@ -166,6 +175,16 @@ def grey_level(x):
 
 @pytest.mark.parametrize("again", [lambda x: x, grey_level, lambda x: x + 1 / 255], ids=["exact", "noise", "brighter"])
 @pytest.mark.parametrize("buffers", [1, 2, 5])
+@pytest.mark.fault(
+    "R02",
+    "a camera alternates between a few old pictures while the robot moves",
+    "The robot stays: `OBSERVATION_STALE`",
+)
+@pytest.mark.fault(
+    "R02",
+    "a camera alternates between a few old pictures while the robot moves",
+    "The robot stays: `OBSERVATION_STALE`",
+)
 def test_old_pictures_are_told_while_the_robot_moves(recorded, looks, again, buffers):
     pictures, state, _ = recorded
     watch, told = cameras(looks), []
@@ -247,6 +266,12 @@ def unanswered(adds_up, states, commands):
 
 
 @pytest.mark.parametrize("adds_up", [TARGETS, DELTAS], ids=["targets", "deltas"])
+@pytest.mark.fault(
+    "R05", "the whole observation is frozen while moves are sent", "The robot goes no further: `OBSERVATION_STALE`"
+)
+@pytest.mark.fault(
+    "R05", "the whole observation is frozen while moves are sent", "The robot goes no further: `OBSERVATION_STALE`"
+)
 def test_a_state_that_does_not_answer_is_told(adds_up):
     steps = torch.tensor([0.1, 0.0]).repeat(20, 1)
     place = steps.cumsum(0)

@@ -94,6 +94,8 @@ KILLS = {
 
 
 @pytest.mark.parametrize("kill", KILLS)
+@pytest.mark.fault("K03", "collect is killed", "The same command goes on, and ends the same")
+@pytest.mark.fault("K24", "collect (Franka) is killed while parts are put together", "The same command ends it")
 def test_a_killed_recording_ends_as_one_that_was_not(undisturbed, tmp_path, monkeypatch, kill):
     name, which = KILLS[kill]
     with monkeypatch.context() as patch, pytest.raises(Killed):
@@ -123,6 +125,12 @@ def test_finished_parts_serve_another_number_of_episodes_or_workers(tmp_path, mo
     assert content(resumed)["observation.state"][:, 0].tolist() == [i for i in range(n) for _ in range(i % 3 + 2)]
 
 
+@pytest.mark.fault(
+    "K21", "the note of a collection is torn by a kill", "That one file is to be removed; all parts are kept"
+)
+@pytest.mark.fault(
+    "K21", "the note of a collection is torn by a kill", "That one file is to be removed; all parts are kept"
+)
 def test_an_unfinished_recording_of_something_else_is_left_alone(tmp_path, monkeypatch):
     with monkeypatch.context() as patch, pytest.raises(Killed):
         killed_at(patch, collection, "_record_part", 1)
@@ -149,6 +157,16 @@ def test_a_finished_dataset_of_another_size_is_not_taken_for_this_one(tmp_path, 
 
 
 @pytest.mark.parametrize("broken", [OSError(errno.ENOSPC, "No space left"), FileNotFoundError("frame-000001.png")])
+@pytest.mark.fault(
+    "D02",
+    "the disk is full while car episodes are collected",
+    "A message; finished parts are kept, and the same command goes on",
+)
+@pytest.mark.fault(
+    "D02",
+    "the disk is full while car episodes are collected",
+    "A message; finished parts are kept, and the same command goes on",
+)
 def test_a_full_disk_is_told_and_finished_parts_are_kept(tmp_path, monkeypatch, broken):
     """LeRobot logs that a picture cannot be written, and then misses it."""
 
@@ -165,6 +183,7 @@ def test_a_full_disk_is_told_and_finished_parts_are_kept(tmp_path, monkeypatch, 
     assert recorded == list(range(2, N))
 
 
+@pytest.mark.fault("K22", "two collect into one folder", "The second is refused (`FolderInUseError`)")
 def test_two_at_once_are_told_apart(tmp_path):
     def other():
         with locked_folder(tmp_path / "one"):
@@ -182,6 +201,7 @@ def test_two_at_once_are_told_apart(tmp_path):
 
 
 @pytest.mark.parametrize("options, message", [({"n": 0}, "num_episodes is 0"), ({"workers": -1}, "--workers is -1")])
+@pytest.mark.fault("N08", "collect of no episodes", "Refused, with what was expected")
 def test_nonsense_is_refused_before_anything_is_written(tmp_path, options, message):
     with pytest.raises(ValueError, match=message):
         record(tmp_path / "x", **options)

@@ -36,6 +36,7 @@ def named(root, path, embedded=False):
 
 @pytest.mark.parametrize("path", OUTSIDE)
 @pytest.mark.parametrize("opener", OPENERS)
+@pytest.mark.fault("M38", "a dataset names a picture outside of its folder", "Refused; no other file is read")
 def test_a_picture_elsewhere_is_not_read(root, path, opener):
     named(root, path)
     with pytest.raises(DatasetContractError, match="not in that folder"):

@@ -46,6 +46,8 @@ def test_report_on_a_recording_without_a_filter_is_refused(tiny_filter, tmp_path
 
 
 @pytest.mark.parametrize("failure", [KeyboardInterrupt, OSError(errno.ENOSPC, "No space left on device")])
+@pytest.mark.fault("K06", "a report is killed while it is written", "The report of before stays")
+@pytest.mark.fault("D04", "the disk is full while a report is written", "The report of before stays")
 def test_a_report_that_breaks_off_leaves_the_one_before(tmp_path, monkeypatch, failure):
     def breaks(descriptor):
         raise failure

@@ -63,6 +63,9 @@ UNREADABLE = {
 
 @pytest.mark.parametrize("content", UNREADABLE)
 @pytest.mark.parametrize("name", ["config.json", "integrity.json", "policy_preprocessor.json"])
+@pytest.mark.fault("C07", "integrity.json is binary", "Refused (`CheckpointError`), the file is named")
+@pytest.mark.fault("C09", "integrity.json is nested deeply", "Refused (`CheckpointError`), the file is named")
+@pytest.mark.fault("C21", "config.json is nested deeply", "Refused (`CheckpointError`), the file is named")
 def test_settings_that_cannot_be_read_are_named(filter_copy, name, content):
     (filter_copy / name).write_bytes(UNREADABLE[content])
     with pytest.raises(CheckpointError, match=name):
@@ -82,6 +85,7 @@ ENTRIES = {
 
 
 @pytest.mark.parametrize("kind", ENTRIES)
+@pytest.mark.fault("C17", "config.json says that epsilon is NaN", "Refused (`CheckpointError`)")
 def test_entries_that_mean_nothing_are_refused(filter_copy, kind):
     tiny.rewrite_json(filter_copy / "config.json", **ENTRIES[kind])
     with pytest.raises(CheckpointError, match=r"config\.json"):
@@ -106,6 +110,8 @@ WEIGHTS = {
 
 @pytest.mark.parametrize("kind", WEIGHTS)
 @pytest.mark.parametrize("what", ["filter", "base policy"])
+@pytest.mark.fault("C30", "weights with a header of 2^40 bytes", "Refused (`CheckpointError`)")
+@pytest.mark.fault("C31", "weights that claim 4 TB", "Refused (`CheckpointError`)")
 def test_weights_that_cannot_be_read_are_named(filter_copy, base, kind, what):
     folder = filter_copy if what == "filter" else base
     (folder / "model.safetensors").write_bytes(WEIGHTS[kind])
@@ -141,6 +147,8 @@ EDITS = {
 
 
 @pytest.mark.parametrize("what", EDITS)
+@pytest.mark.fault("C13", "the critic's activation is edited in config.json", "Refused (`CheckpointError`)")
+@pytest.mark.fault("C14", "the camera's proportions are edited in config.json", "Refused (`CheckpointError`)")
 def test_what_decides_is_sealed(filter_copy, what):
     edit(filter_copy / "config.json", EDITS[what])
     with pytest.raises(CheckpointError, match=r"config\.json was edited"):
@@ -165,6 +173,8 @@ FILES = {
 
 @pytest.mark.parametrize("what", FILES)
 @pytest.mark.parametrize("change", ["flipped", "removed"])
+@pytest.mark.fault("C40", "a bit of the base policy's weights is flipped", "Refused (`CheckpointError`)")
+@pytest.mark.fault("C42", "the base policy's weights are missing", "Refused (`CheckpointError`), the file is named")
 def test_processors_and_the_base_policy_are_sealed(wrapped, what, change):
     file = wrapped / FILES[what]
     flip(file) if change == "flipped" else file.unlink()
@@ -243,6 +253,7 @@ OVERRIDES = {
 
 @pytest.mark.parametrize("what", OVERRIDES)
 @pytest.mark.parametrize("how", ["make_policy", "from_pretrained"])
+@pytest.mark.fault("C49", "the command line gives another fps or state_mean", "Refused (`CheckpointError`)")
 def test_what_belongs_to_the_weights_cannot_be_overridden(tiny_filter, what, how):
     """As LeRobot's commands do it: --policy.path with --policy.<option>."""
     config = PreTrainedConfig.from_pretrained(tiny_filter, cli_overrides=[OVERRIDES[what]])
@@ -261,6 +272,7 @@ def test_a_filters_weights_take_no_adapter(tiny_filter):
         LatentSafePolicy.from_pretrained(tiny_filter, config=config)
 
 
+@pytest.mark.fault("C48", "the command line says that an untrained critic is trained", "Refused (`CheckpointError`)")
 def test_a_critic_that_was_never_trained_cannot_be_declared_trained(tiny_world_model):
     config = PreTrainedConfig.from_pretrained(tiny_world_model, cli_overrides=["--trained_on.stage=critic"])
     with pytest.raises(CheckpointError, match=r"trained_on\.stage was overridden"):
@@ -279,6 +291,7 @@ def test_the_law_the_device_and_the_training_are_the_users(tiny_filter):
 
 @pytest.mark.parametrize("name", ["policy_preprocessor.json", "policy_postprocessor.json"])
 @pytest.mark.parametrize("step", [HOOK, {"class": "os.system"}, {"registry_name": "not_registered"}, {}, 3])
+@pytest.mark.fault("H15", "a downloaded processor names a class", "Nothing is run: refused (`CheckpointError`)")
 def test_a_step_that_is_not_registered_is_not_imported(base, name, step):
     edit(base / name, lambda c: c["steps"].append(step))
     with pytest.raises(CheckpointError, match=name):
@@ -305,6 +318,7 @@ def test_numbers_of_a_processor_lie_in_its_folder(base, state):
 
 
 @pytest.mark.parametrize("name", processors.FILES)
+@pytest.mark.fault("C44", "the base policy's processors are missing", "Refused (`CheckpointError`), with the remedy")
 def test_processors_that_are_missing_are_named(base, name):
     (base / name).unlink()
     with pytest.raises(CheckpointError, match=rf"{name} is missing.*migrate_policy_normalization"):
@@ -363,6 +377,18 @@ def nothing_fetched(monkeypatch):
 
 
 @pytest.mark.parametrize("place", ELSEWHERE)
+@pytest.mark.fault(
+    "C45", "config.json names a base policy in another folder or on the Hub", "Refused (`CheckpointError`)"
+)
+@pytest.mark.fault(
+    "H15", "a downloaded config.json names another Hub id", "Nothing is fetched: refused (`CheckpointError`)"
+)
+@pytest.mark.fault(
+    "C45", "config.json names a base policy in another folder or on the Hub", "Refused (`CheckpointError`)"
+)
+@pytest.mark.fault(
+    "H15", "a downloaded config.json names another Hub id", "Nothing is fetched: refused (`CheckpointError`)"
+)
 def test_a_filters_file_names_no_base_policy_elsewhere(filter_copy, nothing_fetched, place):
     tiny.rewrite_json(filter_copy / "config.json", base_policy_path=place)
     with pytest.raises(CheckpointError, match=r"names the base policy.*--policy\.base_policy_path"):
@@ -373,6 +399,12 @@ def test_a_filters_file_names_no_base_policy_elsewhere(filter_copy, nothing_fetc
         make_policy(config, env_cfg=LatentSafeDubinsEnv())
 
 
+@pytest.mark.fault(
+    "C39", "the base policy is missing, and the present folder has one of that name", "Refused (`CheckpointError`)"
+)
+@pytest.mark.fault(
+    "C39", "the base policy is missing, and the present folder has one of that name", "Refused (`CheckpointError`)"
+)
 def test_a_base_policy_that_is_missing_is_not_another_folders(wrapped, tiny_diffusion, tmp_path, monkeypatch):
     edit(wrapped / "integrity.json", lambda record: record.pop("files"))
     shutil.rmtree(wrapped / "base_policy")
@@ -430,6 +462,8 @@ def test_a_downloaded_policy_tells_of_no_dataset_in_a_folder_it_names(base, tmp_
 
 @pytest.mark.parametrize("call", ["save_model_as_safetensor", "seal"])
 @pytest.mark.parametrize("before", ["nothing", "another filter"])
+@pytest.mark.fault("D03", "the disk is full when a trained filter is saved", "What was there stays; save it again")
+@pytest.mark.fault("D05", "the disk is full when a policy is wrapped", "What was there stays; save it again")
 def test_a_full_disk_leaves_what_was_there(policy, filter_copy, tmp_path, monkeypatch, call, before):
     folder = filter_copy if before == "another filter" else tmp_path / "new"
     found = {f: f.read_bytes() for f in folder.rglob("*") if f.is_file()}

@@ -57,6 +57,12 @@ def altered(seen, change):
 
 @pytest.mark.parametrize("fault", SEEN)
 @pytest.mark.parametrize("first", [True, False])
+@pytest.mark.fault("R10", "a camera is missing from an observation", "The robot stays: `OBSERVATION_MISSING`")
+@pytest.mark.fault("R11", "the state is missing from an observation", "The robot stays: `OBSERVATION_NOT_FINITE`")
+@pytest.mark.fault("R13", "a picture of another size", "The robot stays: `OBSERVATION_MALFORMED`")
+@pytest.mark.fault("R14", "a grey picture", "The robot stays: `OBSERVATION_MALFORMED`")
+@pytest.mark.fault("R15", "a picture with an alpha channel", "The robot stays: `OBSERVATION_MALFORMED`")
+@pytest.mark.fault("R16", "a picture of floats in 0 to 1", "The robot stays: `OBSERVATION_MALFORMED`")
 def test_what_cannot_be_seen_is_never_safe(robot, monkeypatch, virtual_time, fault, first):
     """Also in the first tick of an episode, of which nobody knows anything yet. LeRobot gets what was there last."""
     change, reason = SEEN[fault]
@@ -115,6 +121,10 @@ ACTIONS = {
 
 
 @pytest.mark.parametrize("fault", ACTIONS)
+@pytest.mark.fault("R28", "an action value that is None", "The robot stays: `ACTION_NOT_FINITE`")
+@pytest.mark.fault("R29", "an action value that is a string", "The robot stays: `ACTION_NOT_FINITE`")
+@pytest.mark.fault("R30", "an action that lacks a name", "The robot stays: `ACTION_NOT_FINITE`")
+@pytest.mark.fault("R33", "an action value of 1e9", "The robot stays: `ACTION_OUT_OF_RANGE`")
 def test_an_action_that_is_none_of_this_robot_holds_it_still_and_is_told_once(
     robot, caplog, virtual_time, monkeypatch, fault
 ):
@@ -142,6 +152,7 @@ def test_numbers_of_every_kind_are_judged(robot, kind):
 
 
 @pytest.mark.parametrize("unfiltered", [False, True])
+@pytest.mark.fault("R31", "an action with one more name", "The rest is judged; the name is left out, and that is said")
 def test_what_the_filter_does_not_know_never_reaches_the_robot_unless_allowed(
     trained, caplog, monkeypatch, virtual_time, unfiltered
 ):
@@ -157,13 +168,14 @@ def test_what_the_filter_does_not_know_never_reaches_the_robot_unless_allowed(
 
 
 @pytest.mark.parametrize("fault", [*ACTIONS, "too many"])
+@pytest.mark.fault("R34", "a monitor is given any action, also joint moves", "It changes nothing")
 def test_a_monitor_changes_no_action(trained, monkeypatch, virtual_time, fault):
     action = PUSH | {"hand.pos": 0.5} if fault == "too many" else ACTIONS[fault][0]
     with make_robot_from_config(config(trained, {"epsilon": ALWAYS, "mode": "monitor"})) as robot:
         told = []
         monkeypatch.setattr(robot.inner, "send_action", lambda action: told.append(action) or action)
         for _ in range(2):
-            assert robot.send_action(action) is action
+            assert robot.send_action(action) == action
             virtual_time.sleep(PERIOD)
         assert told == [action] * 2
         assert last(robot) is None or last(robot).unsafe.item()
@@ -183,6 +195,16 @@ def test_an_action_that_is_not_finite_never_reaches_the_robot(robot):
 
 
 @pytest.mark.parametrize("told", [None, 0.25])
+@pytest.mark.fault(
+    "R35",
+    "the gripper's reading is NaN, and its command is unknown",
+    "The grip is kept as it was told; if nothing was told yet, nothing is sent (`UnknownPoseError`)",
+)
+@pytest.mark.fault(
+    "R35",
+    "the gripper's reading is NaN, and its command is unknown",
+    "The grip is kept as it was told; if nothing was told yet, nothing is sent (`UnknownPoseError`)",
+)
 def test_a_grip_that_cannot_be_read_is_kept_as_it_was_told_and_else_nothing_is_sent(
     robot, monkeypatch, virtual_time, told
 ):

@@ -43,6 +43,8 @@ def test_an_action_decided_on_an_old_observation_is_not_trusted(robot, virtual_t
     ("slack_s", "took_s", "stale"),
     [(0.0, 0.2, True), (0.0, 0.5, True), (0.0, 2.0, True), (0.0, 0.04, False), (0.5, 0.5, False)],
 )
+@pytest.mark.fault("R06", "reading the robot takes 2 s", "The robot stays: `OBSERVATION_STALE`")
+@pytest.mark.fault("R07", "reading the robot takes half a second", "The robot stays: `OBSERVATION_STALE`")
 def test_the_age_counts_from_before_the_robot_was_read(trained, virtual_time, monkeypatch, slack_s, took_s, stale):
     with make_robot_from_config(config(trained, slack_s=slack_s)) as robot:
         read = robot.inner.get_observation
@@ -108,6 +110,7 @@ def test_moves_between_episodes_are_filtered_unless_allowed(trained, caplog, vir
         assert looping(RECORD_LOOP, tick, **recorded) != pytest.approx(PUSH)
 
 
+@pytest.mark.fault("R46", "a library logs 'Reset the environment'", "Nothing: the filter goes on")
 def test_what_anybody_logs_switches_no_filter_off(trained, virtual_time):
     with make_robot_from_config(config(trained, {"epsilon": ALWAYS}, unfiltered_moves=True)) as robot:
         for line in ("Recording episode 3", "Reset the environment", "Returning robot to initial position"):
@@ -132,6 +135,7 @@ def test_another_thread_than_the_loops_moves_nothing_unfiltered(trained):
 
 
 @pytest.mark.parametrize("level", [logging.WARNING, logging.INFO])
+@pytest.mark.fault("R47", "episodes begin while logging is at WARNING", "The history starts anew")
 def test_each_episode_starts_anew_even_one_that_is_recorded_again(robot, monkeypatch, level, virtual_time):
     """Whatever is logged, and also if no tick comes between two episodes."""
     logging.getLogger().setLevel(level)
@@ -154,6 +158,7 @@ RATES = {
 
 
 @pytest.mark.parametrize("rate", RATES)
+@pytest.mark.fault("R40", "a loop ten times too slow or too fast", "The robot stays: `WRONG_RATE`")
 def test_a_loop_of_another_rate_is_not_trusted_from_the_second_tick_on(robot, caplog, virtual_time, rate):
     gap, wrong = RATES[rate]
     for _ in range(2):
@@ -167,6 +172,16 @@ def failing(*_):
     raise ConnectionError("no answer from the arm")
 
 
+@pytest.mark.fault(
+    "R25",
+    "reading the robot raises an error",
+    "The robot stays: `OBSERVATION_STALE`; the fifth time in a row the error is raised",
+)
+@pytest.mark.fault(
+    "R25",
+    "reading the robot raises an error",
+    "The robot stays: `OBSERVATION_STALE`; the fifth time in a row the error is raised",
+)
 def test_a_robot_that_is_not_read_stays_and_fails_aloud_the_fifth_time(robot, monkeypatch, virtual_time):
     first = robot.get_observation()
     robot.send_action(PUSH)
@@ -202,6 +217,12 @@ def test_a_robot_that_shows_nothing_at_all_fails_at_once(robot, monkeypatch):
     assert not any(action == PUSH for action in calls)
 
 
+@pytest.mark.fault(
+    "R37", "sending to the robot raises an error", "It is logged; the fifth time in a row the error is raised"
+)
+@pytest.mark.fault(
+    "R37", "sending to the robot raises an error", "It is logged; the fifth time in a row the error is raised"
+)
 def test_a_robot_that_takes_no_action_fails_aloud_the_fifth_time(robot, monkeypatch, virtual_time):
     with monkeypatch.context() as m:
         m.setattr(robot.inner, "send_action", failing)
@@ -226,6 +247,12 @@ REPORTS = {
 
 
 @pytest.mark.parametrize("report", REPORTS)
+@pytest.mark.fault(
+    "R37", "the robot returns None, NaN or other names", "What it was told counts as executed, and that is said"
+)
+@pytest.mark.fault(
+    "R37", "the robot returns None, NaN or other names", "What it was told counts as executed, and that is said"
+)
 def test_a_robot_that_does_not_say_what_it_did_did_what_it_was_told(robot, monkeypatch, caplog, virtual_time, report):
     monkeypatch.setattr(robot.inner, "send_action", lambda _: REPORTS[report])
     for _ in range(3):

@@ -80,6 +80,12 @@ def test_without_a_fresh_observation_it_looks_itself(robot, virtual_time):
     assert any((first[key] != robot.filter.shield.latent[key]).any() for key in first)
 
 
+@pytest.mark.fault(
+    "R02", "a camera repeats an old picture while the robot moves", "The robot stays: `OBSERVATION_STALE`"
+)
+@pytest.mark.fault(
+    "R02", "a camera repeats an old picture while the robot moves", "The robot stays: `OBSERVATION_STALE`"
+)
 def test_a_camera_that_repeats_itself_while_the_robot_moves_is_stale(robot, virtual_time, monkeypatch):
     frozen, reasons = robot.get_observation(), []
     read = robot.inner.get_observation
@@ -176,6 +182,7 @@ def twins(trained):
         yield first, second
 
 
+@pytest.mark.fault("R44", "two robots have one filter; one of them is blind", "Each decides by what it sees itself")
 def test_a_blind_robot_takes_nothing_from_another(twins, monkeypatch):
     seeing, blind = twins
     read = blind.inner.get_observation
@@ -186,6 +193,7 @@ def test_a_blind_robot_takes_nothing_from_another(twins, monkeypatch):
 
 
 @pytest.mark.parametrize("alike", [True, False])
+@pytest.mark.fault("R45", "two robots have one filter; one of them is in danger", "Each decides by what it sees itself")
 def test_a_robot_decides_for_itself_even_where_another_sees_the_same(twins, trained, alike):
     first, second = twins
     second.inner.reset(first.config.inner.seed if alike else 9)
@@ -203,6 +211,12 @@ def test_a_policys_decision_serves_the_robot_that_it_sees_alone(twins, trained):
     assert last(first) is policy.shield.decision
 
 
+@pytest.mark.fault(
+    "R43b", "another thread decides between a decision and its use", "What is executed is what this call decided"
+)
+@pytest.mark.fault(
+    "R43b", "another thread decides between a decision and its use", "What is executed is what this call decided"
+)
 def test_what_is_executed_is_what_this_call_decided(robot, monkeypatch, virtual_time):
     """Another thread, or a policy, asks the same shield between the decision and its use."""
     shield, hear = robot.filter.shield, robot._carry_out
@@ -215,6 +229,7 @@ def test_what_is_executed_is_what_this_call_decided(robot, monkeypatch, virtual_
     assert robot.send_action(PUSH | {"delta_x.pos": 1e9}) == pytest.approx(STILL)
 
 
+@pytest.mark.fault("R43b", "several threads send actions at once", "They take turns")
 def test_threads_take_turns(robot, virtual_time):
     wild, sent, seen = PUSH | {"delta_x.pos": 1e9}, [], robot.get_observation()
     robot.inner.get_observation = lambda: seen  # each thread would need a renderer of its own

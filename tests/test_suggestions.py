@@ -125,6 +125,7 @@ def broken_margin(root, policy, monkeypatch):
     [(broken_state, "is nan in frame 2 of episode 4"), (broken_pictures, "OSError: a picture is cut"),
      (broken_margin, "the filter's margin is nan in frame 2")],
 )  # fmt: skip
+@pytest.mark.fault("M39", "a filter cannot judge one episode", "That episode says why; the page shows all others")
 def test_an_episode_that_cannot_be_judged_says_why_and_the_others_are_judged(
     root, policy, dataset_meta, break_it, why, monkeypatch
 ):
@@ -168,6 +169,7 @@ def forked(monkeypatch):
     return lambda judge: monkeypatch.setattr(suggestions, "_judge", judge)
 
 
+@pytest.mark.fault("L17", "the process that suggests labels is killed", "A message, with the remedy")
 def test_a_process_that_is_killed_before_its_first_answer_is_a_message(root, forked):
     forked(killed)
     with pytest.raises(

@@ -40,6 +40,12 @@ def content(folder):
 
 @pytest.mark.parametrize("kind", TRAIN)
 @pytest.mark.parametrize("step", ["save_policy", "claim"])
+@pytest.mark.fault(
+    "K04", "train-reachability is killed while it saves", "No torn checkpoint; the same command ends the same"
+)
+@pytest.mark.fault(
+    "K04", "train-reachability is killed while it saves", "No torn checkpoint; the same command ends the same"
+)
 def test_a_killed_training_ends_as_one_that_was_not(
     tiny_world_model, whole, cache_meta, tmp_path, monkeypatch, kind, step
 ):
@@ -71,6 +77,7 @@ TEARS = {
 
 
 @pytest.mark.parametrize("tear", TEARS)
+@pytest.mark.fault("K04", "a torn checkpoint is in the output folder", "It is moved aside, and that is said")
 def test_a_torn_checkpoint_is_moved_aside(tiny_world_model, whole, cache_meta, tmp_path, tear, caplog):
     out = shutil.copytree(whole["reachability"], tmp_path / "out")
     TEARS[tear](out)
@@ -89,6 +96,7 @@ def test_what_is_no_filter_is_left_alone(tiny_world_model, tiny_diffusion, cache
     assert (out / "precious").read_text() == "data"
 
 
+@pytest.mark.fault("P03", "two trainings write one folder", "The second is refused (`FolderInUseError`)")
 def test_two_at_once_are_told_apart(tiny_world_model, cache_meta, tmp_path):
     entered, left = threading.Event(), threading.Event()
 
@@ -120,6 +128,7 @@ def test_a_critic_that_diverged_is_not_saved(tiny_world_model, cache_meta, tmp_p
 
 
 @pytest.mark.parametrize("steps", [0, -5])
+@pytest.mark.fault("N07", "train-reachability of no steps", "Refused, with what was expected")
 def test_no_steps_make_no_critic(tiny_world_model, cache_meta, tmp_path, steps):
     with pytest.raises(ValueError, match=f"--steps is {steps}; expected at least 1"):
         train_reachability(tiny_world_model, cache_meta, tmp_path / "out", steps=steps)
@@ -149,6 +158,8 @@ NONSENSE = {
 
 
 @pytest.mark.parametrize("message", NONSENSE)
+@pytest.mark.fault("N07", "train-reachability without seeds", "Refused, with what was expected")
+@pytest.mark.fault("N08", "cache of pictures of no size", "Refused, with what was expected")
 def test_options_that_mean_nothing_are_refused_before_any_work(message):
     with pytest.raises(ValueError, match=message):
         NONSENSE[message]()

@@ -16,6 +16,7 @@ from lerobot_latentsafe.datasets.columns import write_decisions
 from lerobot_latentsafe.datasets.decisions import FILE
 from lerobot_latentsafe.robots.shielded.config_shielded import LatentSafeShieldedConfig
 from lerobot_latentsafe.robots.shielded.shielded import connected_shield
+from lerobot_latentsafe.runtime.options import require_at_least
 
 
 @dataclass
@@ -51,7 +52,7 @@ class Collect:
     - so101_careful, so101_reckless: demonstrations, to the mark, or 5.5 cm past it
     - so101_mix: both, undisturbed and held now and then, with pushes by fits and starts and random motion
 
-    If a recording of the Franka was killed, start it again: it goes on.
+    If a recording was killed, start it again: it goes on.
     """
 
     source: str
@@ -60,7 +61,11 @@ class Collect:
     seed: int = 0
     """At one seed all sources start from the same scenes: where variety counts, give each its own."""
     workers: int = 1
-    """Processes that record the Franka."""
+    """Processes that record."""
+
+    def __post_init__(self) -> None:
+        require_at_least("--seed", self.seed, 0)
+        require_at_least("--workers", self.workers, 1)
 
     def run(self) -> None:
         """Record, and say how much."""

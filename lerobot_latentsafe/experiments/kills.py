@@ -37,6 +37,8 @@ SIZES = [f"world_model.{name}={value}" for name, value in SMALL.items()]
 SIZES += ["margin.clips=64", "reachability.critic_hidden=[16]", "reachability.actor_hidden=[16]"]
 SIZES += ["reachability.steps=60", "reachability.pool=512", "reachability.horizon=4", "reachability.batch_size=32"]
 SIZES += ["reachability.refresh=10"]
+OF_LEROBOTS_RUN = ("train_config.json", "rng_state.safetensors")
+"""Of a lerobot-train: what was typed, and random numbers, of which a new data loader takes one more."""
 Run = Callable[[list[str]], None]
 """The command `latentsafe`, given what is typed after it."""
 
@@ -196,7 +198,8 @@ def finished(words: list[str], log: Path, run: Run) -> float:
 def left_by(folder: Path) -> dict[str, object]:
     """All that a verb has left: name of a file -> its content, as far as it does not tell of time and place."""
     files = [path for path in sorted(folder.rglob("*")) if path.is_file() and "last" not in path.parts]
-    return {path.relative_to(folder).as_posix(): _content(path) for path in files}
+    kept = [path for path in files if path.name not in OF_LEROBOTS_RUN and path.suffix != ".lock"]
+    return {path.relative_to(folder).as_posix(): _content(path) for path in kept}
 
 
 def _content(path: Path) -> object:
@@ -210,7 +213,9 @@ def _content(path: Path) -> object:
         return np.load(path).tobytes()
     if path.suffix in (".json", ".jsonl", ".html"):
         text = re.sub(
-            r'"(cpu_s|output_dir|checkpoint_path|resume|config_path|update_s|data_s)": [^,}\n]*', "", path.read_text()
+            r'"(cpu_s|pretrained_path|output_dir|checkpoint_path|resume|config_path|update_s|data_s)": [^,}\n]*',
+            "",
+            path.read_text(),
         )
         return re.sub(r"Made by .*? at commit .*?<", "", text)
     return path.read_bytes()

@@ -61,6 +61,7 @@ class LatentSafeShielded(WrappedRobot):
         check_fit(self.inner, config.filter, self.filter.config, config.fps)
         pace, declared = self.filter.shield.pace, getattr(self.inner, "slack_s", 0.0)
         pace.strict, pace.slack_s = True, declared if config.slack_s is None else config.slack_s
+        self.filter.shield.guard.begun = True  # it fits; what is wrong from now on is a fault
         self.journal = Journal(config.journal) if config.journal else None
         self._events, self._lock = LeRobotEvents(), threading.RLock()
         self._sent: dict[str, float] = {}
@@ -71,6 +72,7 @@ class LatentSafeShielded(WrappedRobot):
     def connect(self, calibrate: bool = True) -> None:
         """Connect the inner robot."""
         self.inner.connect(calibrate)
+        self._sent.clear()
         self._forget()
         _connected.append(self)
 
@@ -204,9 +206,7 @@ class LatentSafeShielded(WrappedRobot):
             if decision is None:
                 fault = Reason.OBSERVATION_STALE if self._unread else Reason.PASSED
                 decision = shield(batch, proposed, age_s, fault=fault)
-        except UnknownPoseError:
-            raise
-        except Exception as e:
+        except Exception as e:  # it may be known here what is to stay
             shield.note_failure("the filter could not decide", e)
             return None
         if decision.reason.item() == Reason.WRONG_RATE:
