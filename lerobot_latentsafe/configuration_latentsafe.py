@@ -168,6 +168,16 @@ class LatentSafeConfig(PreTrainedConfig):
         )
 
     def validate_features(self) -> None:
-        """Refuse a dataset without actions; one without proprioception is read by its pictures alone."""
+        """Refuse a dataset without actions; one without proprioception is read by its pictures alone.
+
+        Raises:
+            ValueError: there is no action, or one of other numbers than the weights give.
+        """
         if not self.action_feature:
-            raise ValueError("latentsafe needs an action feature; the dataset has none")
+            raise ValueError(
+                "latentsafe needs an action feature, and output_features names none: take a dataset with actions, or "
+                "restore the filter's config.json"
+            )
+        n, shape = len(self.trained_on.action_names or []), tuple(self.action_feature.shape)
+        if n and shape != (n,):
+            raise ValueError(f"output_features says that an action is {shape}, and the filter commands {n} numbers")

@@ -321,6 +321,7 @@ def _check(folder: Path, config: PreTrainedConfig, training: bool) -> None:
         )
     check_sealed(folder, SEALED)
     check_in_use(folder, config, SEALED_ENTRIES)
+    config.validate_features()
     check_own_processors(config, folder, renames=training)
 
 

@@ -121,9 +121,9 @@ def fault(number: str, what: str, outcome: str):
     return pytest.mark.fault(number, what, outcome)
 
 
-def row(number: str, what: str, *given, outcome: str, marks=()):
+def row(number: str, what: str, *given, outcome: str):
     """A row of a table of faults."""
-    return pytest.param(*given, id=f"{number} {what}", marks=[fault(number, what, outcome), *marks])
+    return pytest.param(*given, id=f"{number} {what}", marks=fault(number, what, outcome))
 
 
 def stays(number: str, what: str, inject, reason: Reason):

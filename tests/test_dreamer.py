@@ -172,9 +172,6 @@ def test_a_run_killed_while_it_writes_ends_as_one_that_was_not(trained, tmp_path
 @pytest.mark.fault(
     "K11", "options.json of train-dreamer is torn by a kill", "That one file is to be removed; the run goes on"
 )
-@pytest.mark.fault(
-    "K11", "options.json of train-dreamer is torn by a kill", "That one file is to be removed; the run goes on"
-)
 def test_a_note_torn_by_a_kill_is_told_and_the_rest_goes_on(trained, tmp_path):
     folder = shutil.copytree(trained, tmp_path / "run")
     (folder / "options.json").write_text("")

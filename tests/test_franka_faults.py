@@ -90,13 +90,6 @@ FAULTS = {
 @pytest.mark.fault(
     "F04", "the driver raises in the watchdog", "The arm stops until it is connected anew (`ArmFaultError`)"
 )
-@pytest.mark.fault("F01", "a measured position is NaN", "The arm stops until it is connected anew (`ArmFaultError`)")
-@pytest.mark.fault(
-    "F03", "the driver raises in the stream thread", "The arm stops until it is connected anew (`ArmFaultError`)"
-)
-@pytest.mark.fault(
-    "F04", "the driver raises in the watchdog", "The arm stops until it is connected anew (`ArmFaultError`)"
-)
 def test_a_fault_of_the_arm_stops_it_until_it_is_connected_anew(robot, clock, name, broken, message, noticed_by):
     hangs, act = broken == FOREVER.wait, lambda: robot.send_action(STILL | {"delta_x.pos": 0.01})
     act()
@@ -160,9 +153,6 @@ def test_an_action_that_comes_while_the_watchdog_asks_is_followed(robot, clock):
     assert robot._stream.target() is wanted and robot._stream.error is None
 
 
-@pytest.mark.fault(
-    "F06b", "recovering fails, then the arm answers again", "Refused until it is connected anew (`ArmFaultError`)"
-)
 @pytest.mark.fault(
     "F06b", "recovering fails, then the arm answers again", "Refused until it is connected anew (`ArmFaultError`)"
 )

@@ -159,9 +159,6 @@ POINTS = [
 @pytest.mark.fault(
     "K31", "record is killed in the third episode", "LeRobot reads the saved episodes; --resume=true goes on"
 )
-@pytest.mark.fault(
-    "K31", "record is killed in the third episode", "LeRobot reads the saved episodes; --resume=true goes on"
-)
 def test_a_killed_recording_holds_what_was_saved_and_goes_on(tmp_path, whole, where, nth, word, saved):
     root = tmp_path / "data"
     killed(lambda: record(root, EPISODES), where, nth, word)
@@ -237,9 +234,6 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("fault", BROKEN)
-@pytest.mark.fault(
-    "K36", "the journal of decisions is deleted, torn or another's", "Refused with the remedy; nothing is changed"
-)
 @pytest.mark.fault(
     "K36", "the journal of decisions is deleted, torn or another's", "Refused with the remedy; nothing is changed"
 )

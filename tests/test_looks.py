@@ -138,10 +138,6 @@ def test_also_by_a_filter_that_knows_no_looks(recorded, name):
 @pytest.mark.fault(
     "S15", "a camera upside down or mirrored, where the data tell it", "The robot stays: `OBSERVATION_UNFAMILIAR`"
 )
-@pytest.mark.fault("S14", "red and blue exchanged, where the data tell it", "The robot stays: `OBSERVATION_UNFAMILIAR`")
-@pytest.mark.fault(
-    "S15", "a camera upside down or mirrored, where the data tell it", "The robot stays: `OBSERVATION_UNFAMILIAR`"
-)
 def test_a_picture_that_the_data_never_show_is_told(recorded, looks, name, key):
     pictures, _, _ = recorded
     watch = cameras(looks)
@@ -175,11 +171,6 @@ def grey_level(x):
 
 @pytest.mark.parametrize("again", [lambda x: x, grey_level, lambda x: x + 1 / 255], ids=["exact", "noise", "brighter"])
 @pytest.mark.parametrize("buffers", [1, 2, 5])
-@pytest.mark.fault(
-    "R02",
-    "a camera alternates between a few old pictures while the robot moves",
-    "The robot stays: `OBSERVATION_STALE`",
-)
 @pytest.mark.fault(
     "R02",
     "a camera alternates between a few old pictures while the robot moves",
@@ -266,9 +257,6 @@ def unanswered(adds_up, states, commands):
 
 
 @pytest.mark.parametrize("adds_up", [TARGETS, DELTAS], ids=["targets", "deltas"])
-@pytest.mark.fault(
-    "R05", "the whole observation is frozen while moves are sent", "The robot goes no further: `OBSERVATION_STALE`"
-)
 @pytest.mark.fault(
     "R05", "the whole observation is frozen while moves are sent", "The robot goes no further: `OBSERVATION_STALE`"
 )

@@ -128,9 +128,6 @@ def test_finished_parts_serve_another_number_of_episodes_or_workers(tmp_path, mo
 @pytest.mark.fault(
     "K21", "the note of a collection is torn by a kill", "That one file is to be removed; all parts are kept"
 )
-@pytest.mark.fault(
-    "K21", "the note of a collection is torn by a kill", "That one file is to be removed; all parts are kept"
-)
 def test_an_unfinished_recording_of_something_else_is_left_alone(tmp_path, monkeypatch):
     with monkeypatch.context() as patch, pytest.raises(Killed):
         killed_at(patch, collection, "_record_part", 1)
@@ -157,11 +154,6 @@ def test_a_finished_dataset_of_another_size_is_not_taken_for_this_one(tmp_path, 
 
 
 @pytest.mark.parametrize("broken", [OSError(errno.ENOSPC, "No space left"), FileNotFoundError("frame-000001.png")])
-@pytest.mark.fault(
-    "D02",
-    "the disk is full while car episodes are collected",
-    "A message; finished parts are kept, and the same command goes on",
-)
 @pytest.mark.fault(
     "D02",
     "the disk is full while car episodes are collected",

@@ -383,12 +383,6 @@ def nothing_fetched(monkeypatch):
 @pytest.mark.fault(
     "H15", "a downloaded config.json names another Hub id", "Nothing is fetched: refused (`CheckpointError`)"
 )
-@pytest.mark.fault(
-    "C45", "config.json names a base policy in another folder or on the Hub", "Refused (`CheckpointError`)"
-)
-@pytest.mark.fault(
-    "H15", "a downloaded config.json names another Hub id", "Nothing is fetched: refused (`CheckpointError`)"
-)
 def test_a_filters_file_names_no_base_policy_elsewhere(filter_copy, nothing_fetched, place):
     tiny.rewrite_json(filter_copy / "config.json", base_policy_path=place)
     with pytest.raises(CheckpointError, match=r"names the base policy.*--policy\.base_policy_path"):
@@ -399,9 +393,6 @@ def test_a_filters_file_names_no_base_policy_elsewhere(filter_copy, nothing_fetc
         make_policy(config, env_cfg=LatentSafeDubinsEnv())
 
 
-@pytest.mark.fault(
-    "C39", "the base policy is missing, and the present folder has one of that name", "Refused (`CheckpointError`)"
-)
 @pytest.mark.fault(
     "C39", "the base policy is missing, and the present folder has one of that name", "Refused (`CheckpointError`)"
 )

@@ -200,11 +200,6 @@ def test_an_action_that_is_not_finite_never_reaches_the_robot(robot):
     "the gripper's reading is NaN, and its command is unknown",
     "The grip is kept as it was told; if nothing was told yet, nothing is sent (`UnknownPoseError`)",
 )
-@pytest.mark.fault(
-    "R35",
-    "the gripper's reading is NaN, and its command is unknown",
-    "The grip is kept as it was told; if nothing was told yet, nothing is sent (`UnknownPoseError`)",
-)
 def test_a_grip_that_cannot_be_read_is_kept_as_it_was_told_and_else_nothing_is_sent(
     robot, monkeypatch, virtual_time, told
 ):

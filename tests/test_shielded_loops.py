@@ -177,11 +177,6 @@ def failing(*_):
     "reading the robot raises an error",
     "The robot stays: `OBSERVATION_STALE`; the fifth time in a row the error is raised",
 )
-@pytest.mark.fault(
-    "R25",
-    "reading the robot raises an error",
-    "The robot stays: `OBSERVATION_STALE`; the fifth time in a row the error is raised",
-)
 def test_a_robot_that_is_not_read_stays_and_fails_aloud_the_fifth_time(robot, monkeypatch, virtual_time):
     first = robot.get_observation()
     robot.send_action(PUSH)
@@ -220,9 +215,6 @@ def test_a_robot_that_shows_nothing_at_all_fails_at_once(robot, monkeypatch):
 @pytest.mark.fault(
     "R37", "sending to the robot raises an error", "It is logged; the fifth time in a row the error is raised"
 )
-@pytest.mark.fault(
-    "R37", "sending to the robot raises an error", "It is logged; the fifth time in a row the error is raised"
-)
 def test_a_robot_that_takes_no_action_fails_aloud_the_fifth_time(robot, monkeypatch, virtual_time):
     with monkeypatch.context() as m:
         m.setattr(robot.inner, "send_action", failing)
@@ -247,9 +239,6 @@ REPORTS = {
 
 
 @pytest.mark.parametrize("report", REPORTS)
-@pytest.mark.fault(
-    "R37", "the robot returns None, NaN or other names", "What it was told counts as executed, and that is said"
-)
 @pytest.mark.fault(
     "R37", "the robot returns None, NaN or other names", "What it was told counts as executed, and that is said"
 )

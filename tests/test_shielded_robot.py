@@ -83,9 +83,6 @@ def test_without_a_fresh_observation_it_looks_itself(robot, virtual_time):
 @pytest.mark.fault(
     "R02", "a camera repeats an old picture while the robot moves", "The robot stays: `OBSERVATION_STALE`"
 )
-@pytest.mark.fault(
-    "R02", "a camera repeats an old picture while the robot moves", "The robot stays: `OBSERVATION_STALE`"
-)
 def test_a_camera_that_repeats_itself_while_the_robot_moves_is_stale(robot, virtual_time, monkeypatch):
     frozen, reasons = robot.get_observation(), []
     read = robot.inner.get_observation
@@ -211,9 +208,6 @@ def test_a_policys_decision_serves_the_robot_that_it_sees_alone(twins, trained):
     assert last(first) is policy.shield.decision
 
 
-@pytest.mark.fault(
-    "R43b", "another thread decides between a decision and its use", "What is executed is what this call decided"
-)
 @pytest.mark.fault(
     "R43b", "another thread decides between a decision and its use", "What is executed is what this call decided"
 )

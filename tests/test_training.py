@@ -43,9 +43,6 @@ def content(folder):
 @pytest.mark.fault(
     "K04", "train-reachability is killed while it saves", "No torn checkpoint; the same command ends the same"
 )
-@pytest.mark.fault(
-    "K04", "train-reachability is killed while it saves", "No torn checkpoint; the same command ends the same"
-)
 def test_a_killed_training_ends_as_one_that_was_not(
     tiny_world_model, whole, cache_meta, tmp_path, monkeypatch, kind, step
 ):
