@@ -1,5 +1,5 @@
 # Two commands do everything on a fresh machine, set-up included: `make demo` and `make test`.
-.PHONY: setup demo demo-bag test lint docs platforms results
+.PHONY: setup demo demo-bag test lint docs reliability platforms results
 
 PYTHON = .venv/bin/python
 # Tests and commands start many processes: without kept bytecode each would compile all that it imports.
@@ -36,6 +36,10 @@ lint: setup
 # The pages, with the notebook executed, into docs/_build/html.
 docs: setup
 	HF_HUB_OFFLINE=1 .venv/bin/sphinx-build -W --keep-going -q -b html docs docs/_build/html
+
+# docs/reliability.md, by the tests of all faults.
+reliability: setup
+	HF_HUB_OFFLINE=1 $(PYTHON) scripts/reliability.py
 
 # Can requirements.lock be installed on each platform? Asks the package index.
 platforms: setup

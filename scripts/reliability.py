@@ -119,7 +119,8 @@ def _in_order(number: str) -> tuple[str, int, str]:
 
 
 def _upper(text: str) -> str:
-    return text[0].upper() + text[1:]
+    word = text.split()[0]
+    return text[0].upper() + text[1:] if word.isalpha() else text  # names of files and options stay
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -212,10 +212,10 @@ def hanging(shielded):
 
 @faulty.fault(
     "B11",
-    "it hangs for seconds",
+    "a base policy hangs for seconds",
     "The robot stays within a period: `DEADLINE_MISSED`; the policy is asked again when it is back",
 )
-@faulty.fault("B12", "it hangs, and a deadline is set", "The robot stays within a period: `DEADLINE_MISSED`")
+@faulty.fault("B12", "a base policy hangs, and a deadline is set", "The robot stays within a period: `DEADLINE_MISSED`")
 @pytest.mark.parametrize("deadline_ms", [None, 50.0])
 def test_a_policy_that_hangs_holds_nothing_up(hanging, deadline_ms):
     shielded, over, times = hanging
@@ -239,8 +239,8 @@ def test_a_policy_that_hangs_holds_nothing_up(hanging, deadline_ms):
 
 @faulty.fault(
     "B11",
-    "it takes three seconds, and an action comes in the end",
-    "The robot stays: `DEADLINE_MISSED`, for what it wants is of a picture three seconds old",
+    "a base policy takes seconds, and then gives an action",
+    "The robot stays: `DEADLINE_MISSED`, for what it wants is of an old picture",
 )
 @pytest.mark.parametrize("deadline_ms", [None, 5000.0])
 def test_the_time_that_it_took_counts(shielded, deadline_ms):
