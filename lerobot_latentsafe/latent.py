@@ -33,7 +33,7 @@ def replace_rows(latent: Latent, new: Latent, where: Tensor) -> Latent:
 def is_sound(tensors: Latent) -> Tensor:
     """Whether a batch of latents, or of percepts, holds what a model can mean: finite, no number absurd. Bool (B,)."""
     # NaN is not at most anything.
-    return torch.stack([(t.abs() <= ABSURD).flatten(1).all(1) for t in tensors.values()]).all(0)
+    return torch.stack([(t.abs() <= ABSURD).reshape(len(t), -1).all(1) for t in tensors.values()]).all(0)
 
 
 @dataclass(frozen=True)

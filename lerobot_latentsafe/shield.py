@@ -106,7 +106,8 @@ class Shield:
         """Judge nothing once, between episodes, so that the first decision is no slower than the others."""
         if not self.model.is_trained_for_law() or self._warm:
             return
-        with self._lock, self.model.single_precision():
+        drawn_elsewhere = torch.random.fork_rng([self.model.device] if self.model.device.type == "cuda" else [])
+        with self._lock, self.model.single_precision(), drawn_elsewhere:
             units, size = self.model.units, self.model.config.world_model.image_size
             images = {key: torch.zeros(1, 3, size, size, device=units.device) for key in self.guard.cameras.keys}
             self.guard.pose = units.state_mean[None]

@@ -28,6 +28,11 @@ LEAP_TOLERANCE = 0.5
 STEP_TOLERANCE, MISSED_TICKS = 2.0, 1
 """A number of the state that changes by more than so many of the data's largest steps since it was read last is not
 believed; if it could not be read meanwhile, so many ticks count at most."""
+LEAP_SHARE = 0.25
+"""A number that no target is of may also change by this share of its range: a random motion's largest step, in a few
+dozen episodes, says little of that in the next."""
+FULL_TURNS, TURNED = (2 * math.pi, 360.0), 0.9
+"""An angle wraps around if the data show at least this share of a full turn of it, and no more."""
 AT_REST = 0.1
 """A number of the state that changes by less than this share of the data's largest step does not move."""
 LOUDEST = 4.0
@@ -154,7 +159,9 @@ class Units(nn.Module):
     motion_low: Tensor
     motion_high: Tensor
     loudest: Tensor
+    turn: Tensor
     _shown_by: Tensor
+    _is_targets: Tensor
 
     def __init__(self, trained_on: TrainedOn, frozen_commands: list[str]):
         super().__init__()
@@ -187,6 +194,10 @@ class Units(nn.Module):
         shown_by = [c.of_state or c.name for c in commands]
         places = [self.state_names.index(name) if name in self.state_names else -1 for name in shown_by]
         self.register_buffer("_shown_by", torch.tensor(places), persistent=False)
+        targets = {place for place, target in zip(places, self.is_target.tolist()) if target}
+        of_targets = torch.tensor([i in targets for i in range(n_states)], dtype=torch.bool)
+        self.register_buffer("_is_targets", of_targets, persistent=False)
+        self.register_buffer("turn", _turns(self.state_low, self.state_high), persistent=False)
 
     @property
     def device(self) -> torch.device:
@@ -345,11 +356,27 @@ class Units(nn.Module):
             missed: (B, S), ticks since then in which it could not be read.
 
         Returns:
-            bool (B, S): finite, not absurdly far from the data, and not absurdly far from `pose`.
+            bool (B, S): finite, not absurdly far from the data, and not absurdly far from `pose`. Angles wrap around;
+            where one does, what else describes the orientation may leap with it.
         """
         width = self.state_high - self.state_low
         widest = width.amax() if len(width) else width.sum()
         slack = STATE_TOLERANCE * torch.maximum(width, 0.1 * widest)
         near = state.isfinite() & (state >= self.state_low - slack) & (state <= self.state_high + slack)
         step = STEP_TOLERANCE * torch.maximum(self.state_step, 0.01 * widest)
-        return near & ~((state - pose).abs() > step * (1 + missed.clamp(max=MISSED_TICKS)))
+        step = torch.where(self._is_targets, step, torch.maximum(step, LEAP_SHARE * width))
+        leap = (state - pose).abs()
+        wrapped = leap > self.turn / 2
+        leap = torch.where(wrapped, (self.turn - leap).abs(), leap)
+        leaps = leap > step * (1 + missed.clamp(max=MISSED_TICKS))
+        return near & ~(leaps & (self._is_targets | ~wrapped.any(-1, keepdim=True)))
+
+
+def _turns(low: Tensor, high: Tensor) -> Tensor:
+    """A full turn of each number that is an angle which wraps around, infinite of others: (S,)."""
+    turn = torch.full_like(low, torch.inf)
+    for full in FULL_TURNS:
+        width, signed = high - low, (low >= -1.01 * full / 2) & (high <= 1.01 * full / 2)
+        unsigned = (low >= -0.01 * full) & (high <= 1.01 * full)
+        turn = torch.where((width > TURNED * full) & (signed | unsigned), full, turn)
+    return turn

@@ -44,7 +44,7 @@ def jerk(x):
 
 
 def out_of_range(x):
-    x[0, AT:, 1] = 13.0
+    x[0, AT:, 1] = 25.0
     return x
 
 

@@ -476,7 +476,6 @@ def test_only_the_named_episodes_are_labelled_and_checked(capsys, tiny_filter, d
         (["train-reachability", "--policy.path=x", "--output_dir=y"], "cache those episodes"),
         (["label"], "the page shows all episodes"),
         (["write-labels", "--output_dir=y", "--new_repo_id=z"], "lerobot-edit-dataset"),
-        (["merge-decisions", "--output_dir=y", "--new_repo_id=z"], "lerobot-edit-dataset"),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )

@@ -119,6 +119,7 @@ class Closes:
 
     up = 0.9
     """More than the limits allow."""
+    planned = None
 
     def __init__(self):
         self.executed = []

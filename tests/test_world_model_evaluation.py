@@ -92,7 +92,7 @@ def test_what_fails_after_the_horizon_counts_as_safe(policy):
 
 
 def test_a_horizon_of_no_step_is_refused_before_anything_is_loaded():
-    with pytest.raises(ValueError, match="--horizon is 0; expected at least 1 step"):
+    with pytest.raises(ValueError, match="--horizon is 0; expected at least 1"):
         EvalWorldModel(PolicySource("nowhere"), horizon=0).run()
 
 
