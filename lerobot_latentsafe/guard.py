@@ -128,6 +128,7 @@ class Guard:
     Attributes:
         pose: (B, S) in robot units, the last usable reading of each number of the state; NaN before there was one.
         missed: (B, S), ticks since then.
+        unwound: (B, S), what takes out of the state that angles wrapped around since the episode began.
         told: (B, A) in robot units, what the robots were told last.
         moving: bool (B, A), whether what each target is of has moved since the last tick.
         stay: (B, A) in robot units, what would have been to stay at the last tick.
@@ -150,6 +151,7 @@ class Guard:
         self.response.reset()
         self.pose: Tensor | None = None
         self.missed: Tensor | None = None
+        self.unwound: Tensor | None = None
         self.told: Tensor | None = None
         self.moving: Tensor | None = None
         self.stay: Tensor | None = None
@@ -190,7 +192,7 @@ class Guard:
             sides = {key: min(picture.shape[-2:]) for key, picture in pictures.items()}
             whole = self.model.config.world_model.image_size % SIDE == 0  # then what is averaged once serves here, too
             dead, unfamiliar, thumbnails = self.cameras.check(images if whole else pictures, sides)
-            old = self.cameras.repeats(thumbnails, self.model.units.normalise_state(state))
+            old = self.cameras.repeats(thumbnails, self.model.units.normalise_state(state + self.unwound))
             if (dead | unfamiliar).any():
                 self.say_once("; ".join(self.cameras.wrong))
             fault = first_fault(fault, dead, Reason.OBSERVATION_MISSING)
@@ -209,8 +211,11 @@ class Guard:
             finite = torch.ones(n, dtype=torch.bool, device=self.model.device)
         if self.pose is None:
             self.pose, self.missed = torch.full_like(state, torch.nan), torch.zeros_like(state)
+            self.unwound = torch.zeros_like(state)
         usable = units.believable(state, self.pose, self.missed)
         state = torch.where(usable, state, torch.nan)
+        leap = state - self.pose
+        self.unwound = self.unwound - torch.where(leap.abs() > units.largest_leap, leap, 0.0)
         self.moving = units.moves(state, self.pose)
         self.pose, self.missed = torch.where(usable, state, self.pose), (self.missed + 1) * ~usable
         return state, finite, usable.all(-1)
@@ -357,7 +362,7 @@ class Guard:
 
     def adopt(self, other: "Guard") -> None:
         """Take over what another guard remembers of the same robots."""
-        for name in ("pose", "missed", "told", "moving", "stay", "holding", "_proposals"):
+        for name in ("pose", "missed", "unwound", "told", "moving", "stay", "holding", "_proposals"):
             setattr(self, name, copy.copy(getattr(other, name)))
 
     def say_once(self, what: str, which: str = "") -> None:

@@ -28,7 +28,7 @@ LEAP_TOLERANCE = 0.5
 STEP_TOLERANCE, MISSED_TICKS = 2.0, 1
 """A number of the state that changes by more than so many of the data's largest steps since it was read last is not
 believed; if it could not be read meanwhile, so many ticks count at most."""
-LEAP_SHARE = 0.25
+LEAP_SHARE = 0.3
 """A number that no target is of may also change by this share of its range: a random motion's largest step, in a few
 dozen episodes, says little of that in the next."""
 FULL_TURNS, TURNED = (2 * math.pi, 360.0), 0.9
@@ -160,6 +160,8 @@ class Units(nn.Module):
     motion_high: Tensor
     loudest: Tensor
     turn: Tensor
+    largest_leap: Tensor
+    _width: Tensor
     _shown_by: Tensor
     _is_targets: Tensor
 
@@ -198,6 +200,12 @@ class Units(nn.Module):
         of_targets = torch.tensor([i in targets for i in range(n_states)], dtype=torch.bool)
         self.register_buffer("_is_targets", of_targets, persistent=False)
         self.register_buffer("turn", _turns(self.state_low, self.state_high), persistent=False)
+        width = self.state_high - self.state_low
+        widest = width.amax() if n_states else width.sum()
+        self.register_buffer("_width", torch.maximum(width, 0.1 * widest), persistent=False)
+        step = STEP_TOLERANCE * torch.maximum(self.state_step, 0.01 * widest)
+        leap = torch.where(of_targets, step, torch.maximum(step, LEAP_SHARE * self._width))
+        self.register_buffer("largest_leap", leap, persistent=False)
 
     @property
     def device(self) -> torch.device:
@@ -359,16 +367,12 @@ class Units(nn.Module):
             bool (B, S): finite, not absurdly far from the data, and not absurdly far from `pose`. Angles wrap around;
             where one does, what else describes the orientation may leap with it.
         """
-        width = self.state_high - self.state_low
-        widest = width.amax() if len(width) else width.sum()
-        slack = STATE_TOLERANCE * torch.maximum(width, 0.1 * widest)
+        slack = STATE_TOLERANCE * self._width
         near = state.isfinite() & (state >= self.state_low - slack) & (state <= self.state_high + slack)
-        step = STEP_TOLERANCE * torch.maximum(self.state_step, 0.01 * widest)
-        step = torch.where(self._is_targets, step, torch.maximum(step, LEAP_SHARE * width))
         leap = (state - pose).abs()
         wrapped = leap > self.turn / 2
         leap = torch.where(wrapped, (self.turn - leap).abs(), leap)
-        leaps = leap > step * (1 + missed.clamp(max=MISSED_TICKS))
+        leaps = leap > self.largest_leap * (1 + missed.clamp(max=MISSED_TICKS))
         return near & ~(leaps & (self._is_targets | ~wrapped.any(-1, keepdim=True)))
 
 

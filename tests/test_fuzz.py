@@ -65,7 +65,7 @@ def test_no_observation_passes_that_is_not_usable(benches, data, name, healthy_b
         try:
             decision = bench.shield(seen, bench.wanted.clone())
         except Exception as e:
-            assert_typed(bench, e, first=not bench.shield.guard._begun)
+            assert_typed(bench, e, first=not bench.shield.guard.begun)
         else:
             assert_harmless(bench, decision, usable)
 
