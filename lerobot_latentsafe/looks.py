@@ -22,12 +22,13 @@ FACTOR = 2.0
 """A live picture may leave what the dataset shows by this factor."""
 APART = 0.2
 """An alteration is told where every frame of the dataset is on its side by so much; the means are at -1 and 1."""
-SAME = 0.01
-"""Thumbnails that differ nowhere by more are the same picture, encoded again: some two grey levels."""
+SAME = 0.004
+"""Thumbnails that differ nowhere by more are the same picture, encoded again: a grey level."""
 KEPT, REPEATS = 8, 2
 """Different pictures that are remembered; and ticks in a row after which a picture that comes again is an old one."""
-MOVED = 0.05
-"""Standard deviations by which a number of the state may always change unseen."""
+MOVED, MOVED_UNSEEN = 0.05, 0.15
+"""Standard deviations by which a number of the state may always change unseen, by a camera whose look is not known; and
+by one of which it is known."""
 UNSEEN_FACTOR = 2.5
 """Times what the dataset shows to change unseen, beyond which a picture that stays the same is an old one."""
 
@@ -217,7 +218,7 @@ class Cameras:
         self._mean = torch.tensor([look.mean or nowhere for look in each]).view(-1, 3, COARSE, COARSE)
         self._furthest = torch.tensor([FACTOR * look.furthest if look.mean else torch.inf for look in each])
         self._weight, self._offset = _templates(self._mean, keys, self._sees)
-        unseen = [UNSEEN_FACTOR * torch.tensor(look.unseen) + MOVED if look.unseen else None for look in each]
+        unseen = [UNSEEN_FACTOR * torch.tensor(look.unseen) + MOVED_UNSEEN if look.unseen else None for look in each]
         self._unseen = None if None in unseen else torch.stack(unseen)
         self._stream = Stream(SAME if self._unseen is not None else 0.0)
         self.reset()
@@ -286,9 +287,10 @@ class Cameras:
 
 
 def _templates(mean: Tensor, keys: list[str], sees: list[list[str]]) -> tuple[Tensor, Tensor]:
-    """(C, N, D) and (C, N): a picture x (D,) is nearer to alteration n of a camera's mean where w x + b > 0.
+    """(C, N, D) and (C, N): a picture x (D,) is on the side of alteration n of a camera's mean where w x + b > 0.
 
-    |x - m|^2 > |x - a|^2 is linear in x. Rows beyond a camera's alterations never are.
+    |x - m|^2 - |x - a|^2, which is linear in x, must exceed the share APART of |a - m|^2, as it does of those altered in
+    the data. Rows beyond a camera's alterations never do.
     """
     most = max([len(names) for names in sees], default=0)
     weight = mean.new_zeros(len(mean), most, mean[0].numel() if len(mean) else 0)
@@ -297,7 +299,7 @@ def _templates(mean: Tensor, keys: list[str], sees: list[list[str]]) -> tuple[Te
         for n, name in enumerate(names):
             altered = ALTERATIONS[name](mean[c]) if name in ALTERATIONS else mean[keys.index(name)]
             weight[c, n] = 2 * (altered - mean[c]).flatten()
-            offset[c, n] = mean[c].square().sum() - altered.square().sum()
+            offset[c, n] = mean[c].square().sum() - altered.square().sum() - APART * (altered - mean[c]).square().sum()
     return weight, offset
 
 

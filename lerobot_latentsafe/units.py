@@ -28,7 +28,7 @@ LEAP_TOLERANCE = 0.5
 STEP_TOLERANCE, MISSED_TICKS = 2.0, 1
 """A number of the state that changes by more than so many of the data's largest steps since it was read last is not
 believed; if it could not be read meanwhile, so many ticks count at most."""
-LEAP_SHARE = 0.3
+LEAP_SHARE = 0.4
 """A number that no target is of may also change by this share of its range: a random motion's largest step, in a few
 dozen episodes, says little of that in the next."""
 FULL_TURNS, TURNED = (2 * math.pi, 360.0), 0.9
