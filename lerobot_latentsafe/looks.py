@@ -289,8 +289,8 @@ class Cameras:
 def _templates(mean: Tensor, keys: list[str], sees: list[list[str]]) -> tuple[Tensor, Tensor]:
     """(C, N, D) and (C, N): a picture x (D,) is on the side of alteration n of a camera's mean where w x + b > 0.
 
-    |x - m|^2 - |x - a|^2, which is linear in x, must exceed the share APART of |a - m|^2, as it does of those altered in
-    the data. Rows beyond a camera's alterations never do.
+    |x - m|^2 - |x - a|^2, which is linear in x, must exceed the share APART of |a - m|^2, as it does of those altered
+    in the data. Rows beyond a camera's alterations never do.
     """
     most = max([len(names) for names in sees], default=0)
     weight = mean.new_zeros(len(mean), most, mean[0].numel() if len(mean) else 0)
