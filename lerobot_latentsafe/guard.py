@@ -261,7 +261,7 @@ class Guard:
 
     def _wrong_shape(self, key: str, value: Any) -> str | None:
         """What is wrong with the type and shape of an input, if anything."""
-        if not isinstance(value, Tensor) or value.dtype == torch.bool or value.is_complex():
+        if not isinstance(value, Tensor) or not _holds_numbers(value):
             return f"{key} is {_kind(value)}, expected a tensor of numbers"
         if key == OBS_STATE:
             size = len(self.model.units.state_names)
@@ -319,7 +319,7 @@ class Guard:
         return fault, proposed, self._tell_clipped(proposed, clipped, fault)
 
     def _is_action(self, proposed: Any, hold: Tensor) -> bool:
-        if isinstance(proposed, Tensor) and not proposed.is_complex() and proposed.shape == hold.shape:
+        if isinstance(proposed, Tensor) and _holds_numbers(proposed) and proposed.shape == hold.shape:
             return True
         self.say_once(
             f"proposed action is {_kind(proposed)}, expected a tensor of shape {tuple(hold.shape)}: "
@@ -370,6 +370,10 @@ class Guard:
         if (what, which) not in self._said:
             self._said.add((what, which))
             logger.warning("%s%s", what, which and f": {which}")
+
+
+def _holds_numbers(tensor: Tensor) -> bool:
+    return tensor.dtype != torch.bool and not tensor.is_complex()
 
 
 def _kind(value: Any) -> str:

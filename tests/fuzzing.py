@@ -56,7 +56,9 @@ def observations(draw, healthy):
         value, fits = draw(broken_tensors(healthy[key]))
         other_size = key != "observation.state" and isinstance(value, torch.Tensor) and value.dim() == 4
         if fits is False and other_size and value.shape[:2] == healthy[key].shape[:2] and value.numel():
-            fits = None if value.isfinite().all() and value.abs().max() <= 1 else False  # a picture of another size
+            fits = (
+                None if value.isfinite().all() and value.float().abs().max() <= 1 else False
+            )  # a picture of another size
         if draw(st.booleans()) and value is None:
             seen.pop(key)
         else:
