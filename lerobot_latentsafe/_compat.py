@@ -3,7 +3,9 @@
 import logging
 import sys
 from collections import deque
+from collections.abc import Iterator
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, NamedTuple
 
 import pyarrow.parquet as pq
@@ -46,26 +48,27 @@ def quiet_decoder() -> None:
     logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
 
 
-def training_run() -> "TrainPipelineConfig | None":
-    """The options of the lerobot-train that is at work just now, if any: LeRobot hands them to no policy."""
+def _callers() -> Iterator[FrameType]:
+    """The frames of whoever is at work just now, the innermost first."""
     frame = sys._getframe(1)
     while frame is not None:
+        yield frame
+        frame = frame.f_back
+
+
+def training_run() -> "TrainPipelineConfig | None":
+    """The options of the lerobot-train that is at work just now, if any: LeRobot hands them to no policy."""
+    for frame in _callers():
         for options in (frame.f_locals.get("cfg"), frame.f_locals.get("self")):
             if type(options).__name__ == "TrainPipelineConfig":
                 return options
-        frame = frame.f_back
     return None
 
 
 def called_from(module: str) -> bool:
     """Whether a module of LeRobot, or one in a package of it, is at work just now."""
-    frame = sys._getframe(1)
-    while frame is not None:
-        name = frame.f_globals.get("__name__", "")
-        if name == module or name.startswith(f"{module}."):
-            return True
-        frame = frame.f_back
-    return False
+    names = (frame.f_globals.get("__name__", "") for frame in _callers())
+    return any(name == module or name.startswith(f"{module}.") for name in names)
 
 
 class Loop(NamedTuple):
@@ -82,8 +85,7 @@ class Loop(NamedTuple):
 
 def calling_loop() -> Loop | None:
     """The loop that records, or moves a robot between episodes, if one of them is calling: LeRobot tells no robot."""
-    frame = sys._getframe(1)
-    while frame is not None:
+    for frame in _callers():
         spec = frame.f_globals.get("__spec__")  # its name is the module's even if that is run as a program
         place = getattr(spec, "name", None) or frame.f_globals.get("__name__"), frame.f_code.co_name
         if place in RECORDING:
@@ -91,7 +93,6 @@ def calling_loop() -> Loop | None:
             return Loop(None if dataset is None else dataset.num_episodes, began)
         if place in BETWEEN:
             return Loop(None, None)
-        frame = frame.f_back
     return None
 
 

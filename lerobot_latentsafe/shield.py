@@ -97,7 +97,6 @@ class Shield:
         self.executed: Tensor | None = None
         self.observed: dict[str, Tensor] | None = None
         self.decision: FilterDecision | None = None
-        self.decided_at: float | None = None
         self.overrides: Overrides | None = None
         self._told = False
 
@@ -166,12 +165,11 @@ class Shield:
             # What is wrong is not judged: in its place stands what would be done instead, to stay.
             judged = self._hear(torch.where((faults != Reason.PASSED)[:, None], hold, clipped))
             judgement, faults = self._judge(seen, faults, judged, hold)
-            finished = self.clock()
-            self.took_s = finished - started
+            self.took_s = self.clock() - started
             faults = self._late(faults, age_s + self.took_s, Reason.DEADLINE_MISSED, len(hold), self.took_s)
             decision = self._decide(judgement, seen, faults, hold, proposed, clipped)
             decision = replace(decision, heard=judged)
-            self._remember(judgement, decision, observation, finished)
+            self._remember(judgement, decision, observation)
             return decision
 
     def _say_if_disarmed(self) -> None:
@@ -238,11 +236,9 @@ class Shield:
             return by_checks_alone(proposed, hold, faults, monitors, clipped)
         return least_restrictive(proposed, fallback, value, judgement.margin, threshold, faults, monitors, clipped)
 
-    def _remember(
-        self, judgement: Judgement, decision: FilterDecision, observation: dict[str, Any], finished: float
-    ) -> None:
+    def _remember(self, judgement: Judgement, decision: FilterDecision, observation: dict[str, Any]) -> None:
         self.overrides = self.overrides.after(decision.intervened, judgement.retreats)
-        self.belief, self.decision, self.decided_at = judgement.belief, decision, finished
+        self.belief, self.decision = judgement.belief, decision
         self.observed = {key: observation[key] for key in self.model.inputs if key in observation}
         self.was_executed(decision.action)
         self._tell(decision)
@@ -316,7 +312,7 @@ class Shield:
             with self._lock, other._lock:
                 if not (other._decided(observation, action) and self._accepts(other)):
                     continue
-                for name in ("belief", "executed", "observed", "decision", "decided_at", "overrides"):
+                for name in ("belief", "executed", "observed", "decision", "overrides"):
                     setattr(self, name, getattr(other, name))
                 self.guard.adopt(other.guard)
                 return self.decision

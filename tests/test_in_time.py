@@ -2,7 +2,7 @@ import threading
 
 import pytest
 
-from lerobot_latentsafe.runtime.in_time import in_time
+from lerobot_latentsafe.runtime.time_limit import in_time
 
 
 def failing(error):

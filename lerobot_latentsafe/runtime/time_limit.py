@@ -3,7 +3,7 @@
 import queue
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from typing import Any
 
 import torch
@@ -25,12 +25,38 @@ class Worker:
 
 def _serve(asked: queue.SimpleQueue) -> None:
     while True:
-        future, work, given = asked.get()
-        try:
-            future.set_result(work(*given))
-        except BaseException as e:  # SystemExit, too: whoever asked decides
-            future.set_exception(e)
-        del future, work, given  # nothing is kept alive while there is nothing to do
+        _settle(*asked.get())  # nothing is kept alive while there is nothing to do
+
+
+def _settle(future: Future, work: Callable[..., Any], given: tuple = ()) -> None:
+    try:
+        future.set_result(work(*given))
+    except BaseException as e:  # SystemExit, too: whoever asked decides
+        future.set_exception(e)
+
+
+def in_time[Answer](call: Callable[[], Answer], seconds: float, what: str) -> Answer:
+    """What a call returns, if it returns within so many seconds; calls do not wait for each other.
+
+    It runs in a thread of its own, as no call can be ended from outside: one that is late goes on alone, and nobody
+    hears what it returns.
+
+    Args:
+        what: the call's name in errors.
+
+    Raises:
+        TimeoutError: it took longer.
+        RuntimeError: it wanted to end the program.
+        Exception: whatever else it raised.
+    """
+    answer: Future[Answer] = Future()
+    threading.Thread(target=_settle, args=(answer, call), daemon=True, name=f"in-time-{what}").start()
+    if not wait([answer], seconds).done:
+        raise TimeoutError(f"{what} did not end within {seconds:.3g} s")
+    error = answer.exception()
+    if error is not None and not isinstance(error, Exception):
+        raise RuntimeError(f"{what} raised {type(error).__name__}") from error
+    return answer.result()
 
 
 class TimeLimit:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from lerobot_latentsafe.franka.actions import GRIPPER_WIDTH, JOINT_HIGH, JOINT_LOW
 from lerobot_latentsafe.robots.franka.driver import ArmFaultError, ArmState, FrankaDriver, FrankaError, GripperError
-from lerobot_latentsafe.runtime.in_time import in_time
+from lerobot_latentsafe.runtime.time_limit import in_time
 
 MEASURED = {
     "joints": (JOINT_LOW - 0.2, JOINT_HIGH + 0.2),
