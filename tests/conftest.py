@@ -190,6 +190,22 @@ def bench(request, benches):
     return benches[request.param]
 
 
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """Folder of a tiny filter of the simulated Franka."""
+    return tiny.save_franka_filter(tmp_path_factory.mktemp("filter") / "filter")
+
+
+@pytest.fixture
+def robot(trained):
+    """A simulated Franka behind it."""
+    from lerobot.robots.utils import make_robot_from_config
+    from shielded_robots import config
+
+    with make_robot_from_config(config(trained)) as made:
+        yield made
+
+
 @pytest.fixture
 def policy(tiny_filter):
     """The tiny filter, loaded afresh."""

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import threading
 from multiprocessing.pool import ThreadPool
 from pathlib import Path
 from types import SimpleNamespace
@@ -27,7 +26,7 @@ from lerobot_latentsafe.franka.actions import STATE_NAMES, action_limits
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
 from lerobot_latentsafe.policies.dreamer.modeling_dreamer import LatentSafeDreamerPolicy, WorldModelMismatchError
 from lerobot_latentsafe.runtime.checkpoint import CheckpointError
-from lerobot_latentsafe.runtime.files import FolderInUseError, OtherRunError, locked_folder
+from lerobot_latentsafe.runtime.files import FolderInUseError, OtherRunError
 from lerobot_latentsafe.runtime.hub import halve_weights
 from lerobot_latentsafe.safety_model import UntrainedFilterError
 from lerobot_latentsafe.training import train_reachability
@@ -183,20 +182,8 @@ def test_a_note_torn_by_a_kill_is_told_and_the_rest_goes_on(trained, tmp_path):
 
 @pytest.mark.fault("K14", "two train-dreamer write one folder", "The second is refused (`FolderInUseError`)")
 def test_two_at_once_are_told_apart(tmp_path):
-    entered, left = threading.Event(), threading.Event()
-
-    def other():
-        with locked_folder(tmp_path / "run"):
-            entered.set()
-            left.wait()
-
-    thread = threading.Thread(target=other)
-    thread.start()
-    entered.wait()
-    with pytest.raises(FolderInUseError, match=r"is writing .*run already"):
+    with tiny.written_elsewhere(tmp_path / "run"), pytest.raises(FolderInUseError, match=r"is writing .*run already"):
         tiny.dreamer_options(tmp_path / "run").run()
-    left.set()
-    thread.join()
     assert not (tmp_path / "run").exists()
 
 

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import tiny
 import torch
 from lerobot.robots.utils import make_robot_from_config
 from shielded_robots import ALWAYS, PERIOD, PUSH, STILL, config, last
@@ -12,18 +11,6 @@ from lerobot_latentsafe.franka.actions import STATE_NAMES
 from lerobot_latentsafe.guard import UnknownPoseError
 
 pytestmark = pytest.mark.usefixtures("virtual_time")
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    return tiny.save_franka_filter(tmp_path_factory.mktemp("filter") / "filter")
-
-
-@pytest.fixture
-def robot(trained):
-    made = make_robot_from_config(config(trained))
-    with made:
-        yield made
 
 
 PICTURE = np.random.default_rng(0).integers(0, 255, (32, 32, 3), np.uint8)

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tiny
 from lerobot.robots.utils import make_robot_from_config
 from lerobot_loops import RECORD_LOOP, Recorded, looping
 from shielded_robots import ALWAYS, PERIOD, PUSH, STILL, config, last
@@ -18,18 +17,6 @@ from lerobot_latentsafe.decision import Reason
 from lerobot_latentsafe.robots.shielded.shielded import MAX_FAILURES
 
 pytestmark = pytest.mark.usefixtures("virtual_time")
-
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    return tiny.save_franka_filter(tmp_path_factory.mktemp("filter") / "filter")
-
-
-@pytest.fixture
-def robot(trained):
-    made = make_robot_from_config(config(trained))
-    with made:
-        yield made
 
 
 def test_an_action_decided_on_an_old_observation_is_not_trusted(robot, virtual_time):

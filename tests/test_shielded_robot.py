@@ -27,18 +27,6 @@ from lerobot_latentsafe.robots.shielded.config_shielded import LatentSafeShielde
 pytestmark = pytest.mark.usefixtures("virtual_time")
 
 
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    return tiny.save_franka_filter(tmp_path_factory.mktemp("filter") / "filter")
-
-
-@pytest.fixture
-def robot(trained):
-    made = make_robot_from_config(config(trained))
-    with made:
-        yield made
-
-
 def test_it_is_the_inner_robot_to_lerobot(robot):
     assert robot.name == robot.robot_type == "latentsafe_franka_mujoco"
     assert robot.action_features == robot.inner.action_features

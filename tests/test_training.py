@@ -1,7 +1,6 @@
 """Training on a frozen world model: killed, started twice, by two at once, with options that mean nothing."""
 
 import shutil
-import threading
 
 import pytest
 import tiny
@@ -12,7 +11,7 @@ from lerobot_latentsafe import training
 from lerobot_latentsafe.cli.options import PolicySource
 from lerobot_latentsafe.cli.train import Cache, TrainMargin, TrainReachability
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
-from lerobot_latentsafe.runtime.files import FolderInUseError, locked_folder
+from lerobot_latentsafe.runtime.files import FolderInUseError
 from lerobot_latentsafe.training import train_margin, train_reachability
 
 TRAIN = {"margin": train_margin, "reachability": train_reachability}
@@ -95,20 +94,8 @@ def test_what_is_no_filter_is_left_alone(tiny_world_model, tiny_diffusion, cache
 
 @pytest.mark.fault("P03", "two trainings write one folder", "The second is refused (`FolderInUseError`)")
 def test_two_at_once_are_told_apart(tiny_world_model, cache_meta, tmp_path):
-    entered, left = threading.Event(), threading.Event()
-
-    def other():
-        with locked_folder(tmp_path / "out"):
-            entered.set()
-            left.wait()
-
-    thread = threading.Thread(target=other)
-    thread.start()
-    entered.wait()
-    with pytest.raises(FolderInUseError, match=r"is writing .*out already"):
+    with tiny.written_elsewhere(tmp_path / "out"), pytest.raises(FolderInUseError, match=r"is writing .*out already"):
         train_reachability(tiny_world_model, cache_meta, tmp_path / "out")
-    left.set()
-    thread.join()
 
 
 def test_a_critic_that_diverged_is_not_saved(tiny_world_model, cache_meta, tmp_path, monkeypatch):

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shutil
+import threading
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from lerobot_latentsafe.datasets.clips import Clip
 from lerobot_latentsafe.decision import LawConfig
 from lerobot_latentsafe.dubins import car
 from lerobot_latentsafe.margin import MarginConfig
+from lerobot_latentsafe.runtime.files import locked_folder
 from lerobot_latentsafe.units import TrainedOn
 from lerobot_latentsafe.world_models import RSSMConfig
 
@@ -313,3 +315,23 @@ def dreamer_options(output_dir, **changes):
         save_every=2, log_every=1,
     )  # fmt: skip
     return TrainDreamer(output_dir=output_dir, **{**options, **changes})
+
+
+@contextmanager
+def written_elsewhere(folder):
+    """Meanwhile something else writes an output folder."""
+    entered, left = threading.Event(), threading.Event()
+
+    def write():
+        with locked_folder(folder):
+            entered.set()
+            left.wait()
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    entered.wait()
+    try:
+        yield
+    finally:
+        left.set()
+        writer.join()
