@@ -1,5 +1,6 @@
 """Filter laws: given a value, decide whether a proposed action passes. Pure and batched."""
 
+import functools
 import math
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
@@ -272,3 +273,16 @@ def by_checks_alone(
 def first_fault(fault: Tensor, where: Tensor, reason: Reason) -> Tensor:
     """Set a reason on rows (B,) that have none yet."""
     return torch.where((fault == Reason.PASSED) & where, int(reason), fault)
+
+
+def first_of(found: dict[Reason, Tensor]) -> Tensor:
+    """The first reason that holds for each row, or PASSED: (B,) of bool (B,) for each reason, in order."""
+    rank, reasons = _ranked(tuple(found), next(iter(found.values())).device)
+    return reasons[(torch.stack([*found.values()], -1) * rank).amax(-1)]
+
+
+@functools.cache
+def _ranked(found: tuple[Reason, ...], device: torch.device) -> tuple[Tensor, Tensor]:
+    """(K,), the earlier the higher; and the reason of each rank (K + 1,)."""
+    rank = torch.arange(len(found), 0, -1, device=device)
+    return rank, torch.tensor([int(Reason.PASSED), *(int(reason) for reason in reversed(found))], device=device)

@@ -15,11 +15,11 @@ import torch
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from lerobot_latentsafe.decision import Reason, first_fault
-from lerobot_latentsafe.encoders.pictures import check_proportions
+from lerobot_latentsafe.decision import Reason, first_of
 from lerobot_latentsafe.looks import SIDE, Cameras, Response
+from lerobot_latentsafe.pictures import check_proportions
 from lerobot_latentsafe.safety_model import SafetyModel
-from lerobot_latentsafe.units import AT_REST, Units
+from lerobot_latentsafe.units import Units
 
 logger = logging.getLogger(__name__)
 
@@ -116,10 +116,13 @@ def check_plan(units: Units, plan: Tensor, before: Sequence[Tensor] = ()) -> Ten
     leaps = torch.zeros(actions.shape[:2], dtype=torch.bool, device=plan.device)
     leaps[:, 1:] |= units.leaps(actions[:, 1:], [actions[:, :-1]])
     leaps[:, 2:] |= units.leaps(actions[:, 2:], [actions[:, :-2], actions[:, 1:-1]])
-    fault = torch.zeros(plan.shape[:2], dtype=torch.long, device=plan.device)
-    fault = first_fault(fault, ~plan.isfinite().all(-1), Reason.ACTION_NOT_FINITE)
-    fault = first_fault(fault, units.beyond(plan).any(-1), Reason.ACTION_OUT_OF_RANGE)
-    return first_fault(fault, leaps[:, len(before) :], Reason.ACTION_JUMPS)
+    return first_of(
+        {
+            Reason.ACTION_NOT_FINITE: ~plan.isfinite().all(-1),
+            Reason.ACTION_OUT_OF_RANGE: units.beyond(plan).any(-1),
+            Reason.ACTION_JUMPS: leaps[:, len(before) :],
+        }
+    )
 
 
 class Guard:
@@ -130,7 +133,7 @@ class Guard:
         missed: (B, S), ticks since then.
         unwound: (B, S), what takes out of the state that angles wrapped around since the episode began.
         told: (B, A) in robot units, what the robots were told last.
-        moving: bool (B, A), whether what each target is of has moved since the last tick.
+        moving: bool (B, A), whether what each target is of has moved since the last tick; None without targets.
         stay: (B, A) in robot units, what would have been to stay at the last tick.
         holding: bool (B, A), commands that were told to stay.
         begun: whether an observation of this robot has been seen, so that a foreign one is a fault and no mistake of
@@ -140,7 +143,7 @@ class Guard:
     def __init__(self, model: SafetyModel):
         self.model, units = model, model.units
         self.cameras = Cameras(model.world_model.image_keys, model.config.trained_on.looks)
-        self.response = Response(AT_REST * units.state_step, units.adds_up, units.furthest_unanswered)
+        self.response = Response(units.rest, units.adds_up, units.furthest_unanswered)
         self.begun, self._rows = False, 1
         self._said: set[tuple[str, str]] = set()
         self.reset()
@@ -168,37 +171,39 @@ class Guard:
             KeyError, ValueError: the very first observation is none of this robot, or the number of robots changed.
         """
         n, broken = self._check_shapes(observation)
-        fault = torch.zeros(n, dtype=torch.long, device=self.model.device)
-        everyone = torch.ones_like(fault, dtype=torch.bool)
-        for reason in broken.values():
-            fault = first_fault(fault, everyone, reason)
         given = {key: value for key, value in observation.items() if key not in broken}
         state, finite, believed = self._see_state(given, n)
-        pictures = {}
-        for key in self.model.world_model.image_keys:
-            pictures[key], fault, numbers = self._see_picture(key, given.get(key), fault)
-            finite = finite & numbers
-        fault = first_fault(fault, ~finite, Reason.OBSERVATION_NOT_FINITE)
-        fault = first_fault(fault, ~believed, Reason.OBSERVATION_OUT_OF_RANGE)
-        images = {key: self.model.images(picture).clamp(0, 1) for key, picture in pictures.items()}
-        fault = self._compare(pictures, images, state, fault)
+        pictures, malformed, numbers = self._see_pictures(given, n)
+        images = {key: self.model.images(picture) for key, picture in pictures.items()}
+        fault = first_of(
+            {
+                Reason.OBSERVATION_MALFORMED: malformed,
+                Reason.OBSERVATION_NOT_FINITE: ~(finite & numbers),
+                Reason.OBSERVATION_OUT_OF_RANGE: ~believed,
+                **self._compare(pictures, images, state),
+            }
+        )
+        for reason in reversed(broken.values()):  # of all robots
+            fault = torch.full_like(fault, reason)
         self.response.see(state, self.model.units.unknown(n) if self.told is None else self.told)
         self.begun, self._rows = True, n
         return Seen(images, state, fault)
 
-    def _compare(self, pictures: dict[str, Tensor], images: dict[str, Tensor], state: Tensor, fault: Tensor) -> Tensor:
-        """What is wrong beside the data's pictures, and beside what was shown and told before: faults (B,)."""
-        if pictures:
-            sides = {key: min(picture.shape[-2:]) for key, picture in pictures.items()}
-            whole = self.model.config.world_model.image_size % SIDE == 0  # then what is averaged once serves here, too
-            dead, unfamiliar, thumbnails = self.cameras.check(images if whole else pictures, sides)
-            old = self.cameras.repeats(thumbnails, self.model.units.normalise_state(state + self.unwound))
-            if (dead | unfamiliar).any():
-                self.say_once("; ".join(self.cameras.wrong))
-            fault = first_fault(fault, dead, Reason.OBSERVATION_MISSING)
-            fault = first_fault(fault, unfamiliar, Reason.OBSERVATION_UNFAMILIAR)
-            fault = first_fault(fault, old, Reason.OBSERVATION_STALE)
-        return fault
+    def _compare(self, pictures: dict[str, Tensor], images: dict[str, Tensor], state: Tensor) -> dict[Reason, Tensor]:
+        """What is wrong beside the data's pictures, and beside what was shown and told before: bool (B,) each."""
+        if not pictures:
+            return {}
+        sides = {key: min(picture.shape[-2:]) for key, picture in pictures.items()}
+        whole = self.model.config.world_model.image_size % SIDE == 0  # then what is averaged once serves here, too
+        dead, unfamiliar, thumbnails = self.cameras.check(images if whole else pictures, sides)
+        old = self.cameras.repeats(thumbnails, self.model.units.normalise_state(state + self.unwound))
+        if (dead | unfamiliar).any():
+            self.say_once("; ".join(self.cameras.wrong))
+        return {
+            Reason.OBSERVATION_MISSING: dead,
+            Reason.OBSERVATION_UNFAMILIAR: unfamiliar,
+            Reason.OBSERVATION_STALE: old,
+        }
 
     def _see_state(self, given: dict[str, Any], n: int) -> tuple[Tensor, Tensor, Tensor]:
         """The usable numbers of the state (B, S), whether all are finite (B,), and whether all are believed (B,)."""
@@ -214,25 +219,31 @@ class Guard:
             self.unwound = torch.zeros_like(state)
         usable = units.believable(state, self.pose, self.missed)
         state = torch.where(usable, state, torch.nan)
-        leap = state - self.pose
-        self.unwound = self.unwound - torch.where(leap.abs() > units.largest_leap, leap, 0.0)
-        self.moving = units.moves(state, self.pose)
+        if units.turns:
+            leap = state - self.pose
+            self.unwound = self.unwound - torch.where(leap.abs() > units.largest_leap, leap, 0.0)
+        self.moving = units.moves(state, self.pose) if units.has_targets else None
         self.pose, self.missed = torch.where(usable, state, self.pose), (self.missed + 1) * ~usable
         return state, finite, usable.all(-1)
 
-    def _see_picture(self, key: str, picture: Tensor | None, fault: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """A camera's pictures in [0, 1], what is wrong with them (B,), and whether they are finite (B,)."""
-        model, everyone = self.model, torch.ones_like(fault, dtype=torch.bool)
-        if picture is None:
-            shape = model.config.input_features[key].shape
-            return torch.zeros(len(fault), *shape, device=model.device), fault, everyone
-        picture = model.place(picture)
-        low, high = picture.amin((1, 2, 3)), picture.amax((1, 2, 3))  # aminmax is five times slower
-        finite = torch.isfinite(low) & torch.isfinite(high)  # NaN if anything is
-        colours = finite & (low >= -COLOUR_TOLERANCE) & (high <= 1 + COLOUR_TOLERANCE)
+    def _see_pictures(self, given: dict[str, Any], n: int) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+        """Pictures in [0, 1], whether what any camera shows are no colours (B,), and whether all are numbers (B,)."""
+        model, pictures, extremes = self.model, {}, []
+        for key in model.world_model.image_keys:
+            if key in given:
+                pictures[key] = model.place(given[key])
+                extremes += [pictures[key].amin((1, 2, 3)), 1 - pictures[key].amax((1, 2, 3))]  # aminmax is slower
+            else:  # that is said already
+                pictures[key] = torch.zeros(n, *model.config.input_features[key].shape, device=model.device)
+        if not extremes:
+            nothing = torch.zeros(n, dtype=torch.bool, device=model.device)
+            return pictures, nothing, ~nothing
+        least = torch.stack(extremes).unflatten(0, (-1, 2))  # NaN if anything is
+        numbers = least.isfinite().all(1)
+        colours = (least >= -COLOUR_TOLERANCE).all(1)
         if not colours.all():
-            picture = picture.nan_to_num(0.0).clamp(0, 1)
-        return picture, first_fault(fault, finite & ~colours, Reason.OBSERVATION_MALFORMED), finite
+            pictures = {key: picture.nan_to_num(0.0).clamp(0, 1) for key, picture in pictures.items()}
+        return pictures, (numbers & ~colours).any(0), numbers.all(0)
 
     def _check_shapes(self, observation: dict[str, Any]) -> tuple[int, dict[str, Reason]]:
         """The number of robots, and what is wrong with inputs that cannot be used at all."""
@@ -295,27 +306,34 @@ class Guard:
         Args:
             planned: (B, N, A) in robot units, what is to come after the proposal, if that is known.
         """
-        units, everyone = self.model.units, torch.ones_like(fault, dtype=torch.bool)
+        units = self.model.units
         if proposed is not None and not self._is_action(proposed, hold):
             proposed, missing_reason = None, Reason.BASE_POLICY_FAILED
         if proposed is None:
-            fault, proposed = first_fault(fault, everyone, missing_reason), hold
+            fault = torch.where(fault == Reason.PASSED, int(missing_reason), fault)
+            proposed = hold
         proposed = self.model.place(proposed).float()
         finite = torch.isfinite(proposed).all(-1)
-        fault = first_fault(fault, ~finite, Reason.ACTION_NOT_FINITE)
         clipped, out_of_range = units.clip(torch.where(finite[:, None], proposed, hold), self.pose)
-        fault = first_fault(fault, out_of_range, Reason.ACTION_OUT_OF_RANGE)
-        fault = first_fault(fault, units.leaps(clipped, self._proposals), Reason.ACTION_JUMPS)
-        if planned is not None:
-            plan = torch.cat([clipped[:, None], self.model.place(planned).float()], 1)
-            found = check_plan(units, plan)[:, 1:]
-            for reason in (Reason.ACTION_NOT_FINITE, Reason.ACTION_OUT_OF_RANGE, Reason.ACTION_JUMPS):
-                fault = first_fault(fault, (found == reason).any(1), reason)
-        self._proposals.append(clipped)
         mute = self.response.is_missing(clipped)
         if mute.any():
             self.say_once("the state stays as it is, whatever is sent: the robot goes no further until it changes")
-        fault = first_fault(fault, mute, Reason.OBSERVATION_STALE)
+        found = first_of(
+            {
+                Reason.ACTION_NOT_FINITE: ~finite,
+                Reason.ACTION_OUT_OF_RANGE: out_of_range,
+                Reason.ACTION_JUMPS: units.leaps(clipped, self._proposals),
+                Reason.OBSERVATION_STALE: mute,
+            }
+        )
+        fault = torch.where(fault == Reason.PASSED, found, fault)
+        if planned is not None:
+            plan = torch.cat([clipped[:, None], self.model.place(planned).float()], 1)
+            coming = check_plan(units, plan)[:, 1:]
+            order = (Reason.ACTION_NOT_FINITE, Reason.ACTION_OUT_OF_RANGE, Reason.ACTION_JUMPS)
+            found = first_of({reason: (coming == reason).any(1) for reason in order})
+            fault = torch.where(fault == Reason.PASSED, found, fault)
+        self._proposals.append(clipped)
         return fault, proposed, self._tell_clipped(proposed, clipped, fault)
 
     def _is_action(self, proposed: Any, hold: Tensor) -> bool:
@@ -329,6 +347,8 @@ class Guard:
 
     def _tell_clipped(self, proposed: Tensor, clipped: Tensor, fault: Tensor) -> Tensor:
         """What is executed of proposals that pass; says so once where that is not the proposal itself."""
+        if torch.equal(clipped, proposed):
+            return proposed
         passes = (fault == Reason.PASSED)[:, None]
         beyond = passes & ((clipped - proposed).abs() > 1e-5 * proposed.abs().clamp(min=1))
         if beyond.any():
@@ -345,7 +365,9 @@ class Guard:
         Raises:
             UnknownPoseError: commands are positions, and the robots showed no usable state and were told nothing yet.
         """
-        settled = ~self.moving if self.holding is None else ~self.moving | self.holding
+        settled = None
+        if self.moving is not None:
+            settled = ~self.moving if self.holding is None else ~self.moving | self.holding
         hold = self.model.units.hold(state, self.told, settled)
         if not hold.isfinite().all() and self.model.config.law.mode != "monitor":
             raise UnknownPoseError(
@@ -358,7 +380,9 @@ class Guard:
     def was_told(self, action: Tensor) -> None:
         """Remember (B, A) in robot units as what the robots were told."""
         self.told = action
-        self.holding = None if self.stay is None else torch.isclose(action, self.stay)
+        self.holding = None
+        if self.stay is not None:  # isclose is slower
+            self.holding = (action - self.stay).abs() <= 1e-8 + 1e-5 * self.stay.abs()
 
     def adopt(self, other: "Guard") -> None:
         """Take over what another guard remembers of the same robots."""

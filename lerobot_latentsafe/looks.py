@@ -7,12 +7,14 @@ threshold comes from the dataset, with a factor of safety, such that no frame of
 apart is not tested.
 """
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
+
+from lerobot_latentsafe.pictures import averaged
 
 SIDE, THUMBNAIL, COARSE = 32, 16, 8
 """Pixels a side: what is looked at, what is compared with the past, and what with the dataset's mean."""
@@ -70,18 +72,18 @@ class Look:
 
 def shrink(pictures: Tensor) -> Tensor:
     """Pictures (B, C, H, W), grey or of three colours, averaged to (B, 3, SIDE, SIDE)."""
-    small = F.interpolate(pictures, size=(SIDE, SIDE), mode="area")
+    small = averaged(pictures, SIDE)
     return small if small.shape[1] == 3 else small.expand(-1, 3, -1, -1)
 
 
 def thumbnails(small: Tensor) -> Tensor:
     """Pictures (..., SIDE, SIDE) averaged to (..., THUMBNAIL, THUMBNAIL)."""
-    return _averaged(small, SIDE // THUMBNAIL)
+    return averaged(small, THUMBNAIL)
 
 
 def coarse(thumbnail: Tensor) -> Tensor:
     """Thumbnails averaged to (..., COARSE, COARSE)."""
-    return _averaged(thumbnail, THUMBNAIL // COARSE)
+    return averaged(thumbnail, COARSE)
 
 
 def detail(small: Tensor) -> Tensor:
@@ -91,13 +93,17 @@ def detail(small: Tensor) -> Tensor:
 
 def contrast(picture: Tensor) -> Tensor:
     """Mean deviation of pictures (..., 3, H, W) from each half's mean colour; the same of both halves: (..., 3)."""
-    halves = picture.unflatten(-2, (2, -1))  # (..., 3, 2, H / 2, W)
-    deviation = (halves - halves.mean((-2, -1), keepdim=True)).abs().mean((-4, -2, -1))
-    return torch.cat([deviation.mean(-1, keepdim=True), deviation], -1)
+    deviate, average = (weights.to(picture) for weights in _of_halves(picture.shape[-2] * picture.shape[-1]))
+    return (picture.flatten(-2) @ deviate).abs().flatten(-2) @ average
 
 
-def _averaged(pictures: Tensor, n: int) -> Tensor:
-    return F.avg_pool2d(pictures.flatten(0, -4), n).unflatten(0, pictures.shape[:-3])
+@functools.cache
+def _of_halves(n: int) -> tuple[Tensor, Tensor]:
+    """What takes the mean of its half out of each of n pixels (n, n); what averages those of three colours over the
+    whole and over each half (3 n, 3)."""
+    halves = torch.eye(2).repeat_interleave(n // 2, 0)  # (n, 2)
+    average = torch.cat([torch.full((n, 1), 1 / n), halves * 2 / n], 1).repeat(3, 1) / 3
+    return torch.eye(n) - halves @ halves.T * 2 / n, average
 
 
 class Stream:
@@ -125,19 +131,18 @@ class Stream:
         Returns:
             (B, C, S); zero for a camera that shows something new.
         """
-        shown = thumbnail.flatten(2)
+        shown = thumbnail.flatten(2)[:, :, None]
         if self._shown is None:
-            self._shown = shown.new_full((*shown.shape[:2], KEPT, shown.shape[2]), torch.inf)
+            self._shown = shown.new_full((*shown.shape[:2], KEPT, shown.shape[3]), torch.inf)
             self._states = state.new_zeros(*shown.shape[:2], KEPT, state.shape[1])
-            self._oldest = torch.zeros(shown.shape[:2], dtype=torch.long, device=shown.device)
-        same = (self._shown - shown[:, :, None]).abs().amax(-1) <= self.same
-        apart = (self._states - state[:, None, None]).abs().nan_to_num(0.0)
-        new = ~same.any(-1) & shown.isfinite().all(-1)
-        if new.any():
-            robot, camera = new.nonzero(as_tuple=True)
-            place = robot, camera, self._oldest[robot, camera]
-            self._shown[place], self._states[place] = shown[robot, camera], state[robot]
-            self._oldest = (self._oldest + new) % KEPT
+        state = state[:, None, None]
+        same = (self._shown - shown).abs().amax(-1) <= self.same
+        apart = (self._states - state).abs().nan_to_num(0.0)
+        new = (~same.any(-1) & shown[:, :, 0].isfinite().all(-1))[..., None, None]
+        if new.any():  # the oldest goes
+            state = state.expand(-1, shown.shape[1], -1, -1)
+            self._shown = torch.where(new, torch.cat([self._shown[:, :, 1:], shown], 2), self._shown)
+            self._states = torch.where(new, torch.cat([self._states[:, :, 1:], state], 2), self._states)
         return (apart * same[..., None]).amax(2)
 
 
@@ -167,9 +172,12 @@ class Response:
         Args:
             proposed: (B, A), what is to be executed next.
         """
+        far = self._went > self.limit
+        if not far.any():
+            return far.any(-1)
         place = torch.where(self.adds_up, self._sum + proposed, proposed)
         back = (place - self._begin).abs() < self._went
-        return ((self._went > self.limit) & ~back).any(-1)
+        return (far & ~back).any(-1)
 
     def reset(self) -> None:
         """Start an episode."""
@@ -212,12 +220,12 @@ class Cameras:
         self._least = torch.where(least > NOTHING, least, 0.0)  # a half that may be even is not judged
         self._least[:, 0].clamp_(min=NOTHING)
         finest = [look.detail or [0.0, torch.inf] for look in each]
-        self._detail = torch.tensor([[low / FACTOR, high * FACTOR] for low, high in finest])
+        self._finest = torch.tensor([[low / FACTOR, high * FACTOR] for low, high in finest]).view(-1, 2)
         self._sizes = [SIDE if look.detail else 0 for look in each]
         nowhere = [0.0] * (3 * COARSE**2)
-        self._mean = torch.tensor([look.mean or nowhere for look in each]).view(-1, 3, COARSE, COARSE)
-        self._furthest = torch.tensor([FACTOR * look.furthest if look.mean else torch.inf for look in each])
-        self._weight, self._offset = _templates(self._mean, keys, self._sees)
+        mean = torch.tensor([look.mean or nowhere for look in each]).view(-1, 3, COARSE, COARSE)
+        furthest = torch.tensor([FACTOR * look.furthest if look.mean else torch.inf for look in each])
+        self._weight, self._limit = _templates(mean, furthest, keys, self._sees)
         unseen = [UNSEEN_FACTOR * torch.tensor(look.unseen) + MOVED_UNSEEN if look.unseen else None for look in each]
         self._unseen = None if None in unseen else torch.stack(unseen)
         self._stream = Stream(SAME if self._unseen is not None else 0.0)
@@ -239,21 +247,38 @@ class Cameras:
         Returns:
             dead, unfamiliar: bool (B,); and thumbnails (B, cameras, 3, THUMBNAIL, THUMBNAIL) for `repeats`.
         """
-        small = torch.stack([shrink(pictures[key]) for key in self.keys], 1)
+        small = self._shrunk([pictures[key] for key in self.keys])
+        self._move_to(small.device)
         thumbnail = thumbnails(small)
         picture = coarse(thumbnail)
-        dead = (contrast(picture) < self._least.to(small.device)).any(-1)
-        low, high = self._detail.to(small.device).unbind(-1)
+        dead = (contrast(picture) < self._least).any(-1)
         fine = detail(small)
+        blurred = fine < self._finest[:, 0]
         sides = sides or {key: min(picture.shape[-2:]) for key, picture in pictures.items()}
         tiny = [sides[key] < size for key, size in zip(self.keys, self._sizes)]
-        blurred = (fine < low) | torch.tensor(tiny, device=small.device)
-        away = (picture - self._mean.to(small.device)).square().mean((-3, -2, -1)).sqrt()
-        strange = blurred | (fine > high) | (away > self._furthest.to(small.device))
-        altered = torch.einsum("bcd,cnd->bcn", picture.flatten(2), self._weight.to(small.device))
-        altered = altered + self._offset.to(small.device) > 0
+        if any(tiny):
+            blurred = blurred | torch.tensor(tiny, device=small.device)
+        pixels = picture.flatten(2)
+        score = (self._weight @ pixels[..., None]).squeeze(-1)  # (B, C, 1 + N), see _templates
+        score[..., 0] += pixels.square().sum(-1)
+        beyond = score > self._limit
+        strange = blurred | (fine > self._finest[:, 1]) | beyond[..., 0]
+        altered = beyond[..., 1:]
         self._checked = dead, blurred, strange, altered
         return dead.any(1), (strange | altered.any(-1)).any(1), thumbnail
+
+    def _shrunk(self, pictures: list[Tensor]) -> Tensor:
+        """Pictures (B, C, H, W) of each camera, averaged: (B, cameras, 3, SIDE, SIDE)."""
+        if len({picture.shape for picture in pictures}) == 1 and pictures[0].shape[1] == 3:  # all in one go
+            return shrink(torch.stack(pictures, 1).flatten(0, 1)).unflatten(0, (-1, len(pictures)))
+        return torch.stack([shrink(picture) for picture in pictures], 1)
+
+    def _move_to(self, device: torch.device) -> None:
+        """Have all thresholds where the pictures are."""
+        if self._least.device != device:
+            for name in ("_least", "_finest", "_weight", "_limit", "_unseen"):
+                known = getattr(self, name)
+                setattr(self, name, None if known is None else known.to(device))
 
     def repeats(self, thumbnail: Tensor, state: Tensor) -> Tensor:
         """Which robots have a camera that shows an old picture, though they moved: frozen, or going round and round.
@@ -263,7 +288,7 @@ class Cameras:
             state: (B, S), standard deviations; numbers that are not usable are NaN.
         """
         went = self._stream.went_unseen(thumbnail, state)
-        allowed = MOVED if self._unseen is None else self._unseen.to(went.device)
+        allowed = MOVED if self._unseen is None else self._unseen
         old = (went > allowed).any(-1)
         self._repeats = (self._repeats + 1) * old
         return (self._repeats >= REPEATS).any(1)
@@ -286,21 +311,24 @@ class Cameras:
         return said
 
 
-def _templates(mean: Tensor, keys: list[str], sees: list[list[str]]) -> tuple[Tensor, Tensor]:
-    """(C, N, D) and (C, N): a picture x (D,) is on the side of alteration n of a camera's mean where w x + b > 0.
+def _templates(mean: Tensor, furthest: Tensor, keys: list[str], sees: list[list[str]]) -> tuple[Tensor, Tensor]:
+    """Weights w (C, 1 + N, D) and limits (C, 1 + N) for a picture x (D,) of each of C cameras.
 
-    |x - m|^2 - |x - a|^2, which is linear in x, must exceed the share APART of |a - m|^2, as it does of those altered
-    in the data. Rows beyond a camera's alterations never do.
+    x x + w_0 x exceeds its limit where |x - m|, root mean square, exceeds `furthest`; w_n x where x is on the side of
+    alteration n: |x - m|^2 - |x - a|^2, which is linear in x, exceeds the share APART of |a - m|^2, as it does of those
+    altered in the data. Rows beyond a camera's alterations never do.
     """
-    most = max([len(names) for names in sees], default=0)
-    weight = mean.new_zeros(len(mean), most, mean[0].numel() if len(mean) else 0)
-    offset = mean.new_full((len(mean), most), -1.0)
+    most = 1 + max([len(names) for names in sees], default=0)
+    n_pixels = mean[0].numel() if len(mean) else 0
+    weight, limit = mean.new_zeros(len(mean), most, n_pixels), mean.new_full((len(mean), most), torch.inf)
     for c, names in enumerate(sees):
-        for n, name in enumerate(names):
+        weight[c, 0] = -2 * mean[c].flatten()
+        limit[c, 0] = n_pixels * furthest[c].square() - mean[c].square().sum()
+        for n, name in enumerate(names, 1):
             altered = ALTERATIONS[name](mean[c]) if name in ALTERATIONS else mean[keys.index(name)]
             weight[c, n] = 2 * (altered - mean[c]).flatten()
-            offset[c, n] = mean[c].square().sum() - altered.square().sum() - APART * (altered - mean[c]).square().sum()
-    return weight, offset
+            limit[c, n] = altered.square().sum() - mean[c].square().sum() + APART * (altered - mean[c]).square().sum()
+    return weight, limit
 
 
 # -- learning ---

@@ -15,10 +15,10 @@ from torch import Tensor, nn
 from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
 from lerobot_latentsafe.critic import BACKUPS, SafetyCritic, safety_bellman_target
 from lerobot_latentsafe.datasets.clips import Clip
-from lerobot_latentsafe.encoders.pictures import to_model_images
 from lerobot_latentsafe.latent import Latent
 from lerobot_latentsafe.margin import FailureMargin, hinge_loss
 from lerobot_latentsafe.meanings import MeaningError
+from lerobot_latentsafe.pictures import to_model_images
 from lerobot_latentsafe.reachability import look_ahead
 from lerobot_latentsafe.units import Units
 from lerobot_latentsafe.world_models.base import WorldModel

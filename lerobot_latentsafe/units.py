@@ -161,6 +161,14 @@ class Units(nn.Module):
     loudest: Tensor
     turn: Tensor
     largest_leap: Tensor
+    rest: Tensor
+    _least_state: Tensor
+    _most_state: Tensor
+    _least_action: Tensor
+    _most_action: Tensor
+    _largest_step: Tensor
+    _largest_jerk: Tensor
+    _still: Tensor
     _width: Tensor
     _shown_by: Tensor
     _is_targets: Tensor
@@ -206,6 +214,23 @@ class Units(nn.Module):
         step = STEP_TOLERANCE * torch.maximum(self.state_step, 0.01 * widest)
         leap = torch.where(of_targets, step, torch.maximum(step, LEAP_SHARE * self._width))
         self.register_buffer("largest_leap", leap, persistent=False)
+        for name, limit in self._limits().items():
+            self.register_buffer(name, limit, persistent=False)
+
+    def _limits(self) -> dict[str, Tensor]:
+        """What follows from the ranges alone, worked out once and not at every tick."""
+        slack = STATE_TOLERANCE * self._width
+        width = self.action_high - self.action_low
+        margin = torch.where(self.is_target, TARGET_TOLERANCE, RANGE_TOLERANCE) * width
+        still = torch.zeros_like(self.action_low).clamp(self.action_low, self.action_high)
+        return {
+            "_least_state": self.state_low - slack, "_most_state": self.state_high + slack,
+            "_least_action": self.action_low - margin, "_most_action": self.action_high + margin,
+            "_largest_step": (1 + LEAP_TOLERANCE) * self.action_step,
+            "_largest_jerk": (1 + LEAP_TOLERANCE) * self.action_jerk,
+            "_still": torch.where(self.action_varies, still, (self.action_low + self.action_high) / 2),
+            "rest": AT_REST * self.state_step,
+        }  # fmt: skip
 
     @property
     def device(self) -> torch.device:
@@ -216,6 +241,11 @@ class Units(nn.Module):
     def has_targets(self) -> bool:
         """Whether any command is a target, so that actions mean nothing without the state."""
         return bool(self.is_target.any())
+
+    @cached_property
+    def turns(self) -> bool:
+        """Whether any number of the state is an angle that wraps around."""
+        return bool(self.turn.isfinite().any())
 
     # -- actions in and out ---
 
@@ -291,8 +321,7 @@ class Units(nn.Module):
 
     def beyond(self, action: Tensor) -> Tensor:
         """Which commands (..., A) leave the data's range by more than the tolerance, wherever the robot is."""
-        margin = torch.where(self.is_target, TARGET_TOLERANCE, RANGE_TOLERANCE) * (self.action_high - self.action_low)
-        return (action < self.action_low - margin) | (action > self.action_high + margin)
+        return (action < self._least_action) | (action > self._most_action)
 
     def leaps(self, action: Tensor, before: Sequence[Tensor]) -> Tensor:
         """Whether commands (..., A) change faster than the data show, or change how they change: bool (...,).
@@ -302,9 +331,9 @@ class Units(nn.Module):
         """
         far = torch.zeros_like(action, dtype=torch.bool)
         if len(before):
-            far |= (action - before[-1]).abs() > (1 + LEAP_TOLERANCE) * self.action_step
+            far |= (action - before[-1]).abs() > self._largest_step
         if len(before) > 1:
-            far |= (action - 2 * before[-1] + before[-2]).abs() > (1 + LEAP_TOLERANCE) * self.action_jerk
+            far |= (action - 2 * before[-1] + before[-2]).abs() > self._largest_jerk
         return far.any(-1)
 
     def hold(self, state: Tensor, told: Tensor | None = None, settled: Tensor | None = None) -> Tensor:
@@ -325,9 +354,10 @@ class Units(nn.Module):
         """
         seen = self.seen(state)
         told = torch.full_like(seen, torch.nan) if told is None else told
-        still = torch.zeros_like(self.action_low).clamp(self.action_low, self.action_high)
-        still = torch.where(self.action_varies, still, (self.action_low + self.action_high) / 2)
         kept = torch.where(told.isfinite(), told, seen).clamp(self.action_low, self.action_high)
+        stays = torch.where(self.frozen & kept.isfinite(), kept, self._still)
+        if not self.has_targets:
+            return stays
         leap, largest = seen - told, torch.maximum(-self.displacement_low, self.displacement_high)
         far = leap.abs() > self.displacement_scale
         if settled is not None:
@@ -336,9 +366,7 @@ class Units(nn.Module):
         wide = (leap.abs() > largest) & (leap.abs() <= 2 * largest)
         between = torch.where(wide, told + leap.clamp(-largest, largest), seen)
         pose = torch.where(told.isnan() | far, between, told)
-        return torch.where(
-            self.is_target, pose, torch.where(self.frozen & kept.isfinite(), kept, still.expand_as(kept))
-        )
+        return torch.where(self.is_target, pose, stays)
 
     @property
     def still(self) -> Tensor:
@@ -348,7 +376,7 @@ class Units(nn.Module):
 
     def moves(self, state: Tensor, before: Tensor) -> Tensor:
         """Whether what each target is of moved from one state (B, S) to the next: bool (B, A)."""
-        return self.seen(((state - before).abs() > AT_REST * self.state_step).float()) > 0
+        return self.seen(((state - before).abs() > self.rest).float()) > 0
 
     # -- states ---
 
@@ -367,13 +395,14 @@ class Units(nn.Module):
             bool (B, S): finite, not absurdly far from the data, and not absurdly far from `pose`. Angles wrap around;
             where one does, what else describes the orientation may leap with it.
         """
-        slack = STATE_TOLERANCE * self._width
-        near = state.isfinite() & (state >= self.state_low - slack) & (state <= self.state_high + slack)
+        near = state.isfinite() & (state >= self._least_state) & (state <= self._most_state)
         leap = (state - pose).abs()
+        largest = self.largest_leap * (1 + missed.clamp(max=MISSED_TICKS))
+        if not self.turns:
+            return near & ~(leap > largest)
         wrapped = leap > self.turn / 2
         leap = torch.where(wrapped, (self.turn - leap).abs(), leap)
-        leaps = leap > self.largest_leap * (1 + missed.clamp(max=MISSED_TICKS))
-        return near & ~(leaps & (self._is_targets | ~wrapped.any(-1, keepdim=True)))
+        return near & ~((leap > largest) & (self._is_targets | ~wrapped.any(-1, keepdim=True)))
 
 
 def _turns(low: Tensor, high: Tensor) -> Tensor:

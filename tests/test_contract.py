@@ -244,7 +244,7 @@ def test_labels_that_are_none_are_refused(tmp_path, label):
 
 
 def test_a_grey_picture_is_seen_in_three_channels():
-    from lerobot_latentsafe.encoders.pictures import to_model_images
+    from lerobot_latentsafe.pictures import to_model_images
 
     grey = torch.randint(256, (2, 1, 8, 8), dtype=torch.uint8)
     assert torch.equal(to_model_images(grey, 4), to_model_images(grey.repeat(1, 3, 1, 1), 4))

@@ -17,7 +17,7 @@ from lerobot_latentsafe.datasets import build_cache
 from lerobot_latentsafe.datasets.build_cache import build_frame_cache
 from lerobot_latentsafe.datasets.frame_cache import FrameCache, FrameCacheError, dataset_fingerprint
 from lerobot_latentsafe.datasets.labels import FailureLabels
-from lerobot_latentsafe.encoders.pictures import to_model_images
+from lerobot_latentsafe.pictures import to_model_images
 
 
 @pytest.fixture

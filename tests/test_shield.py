@@ -10,6 +10,7 @@ from lerobot_latentsafe.critic import FallbackConfig
 from lerobot_latentsafe.datasets.clips import Clip
 from lerobot_latentsafe.decision import LawConfig, Overrides, Reason
 from lerobot_latentsafe.shield import Shield
+from lerobot_latentsafe.units import Units
 
 IMAGE = "observation.image"
 STATES = ((-0.9, 0.1, 0.0), (-0.7, -0.3, 0.5), (0.6, 0.6, 2.0))
@@ -442,14 +443,9 @@ def test_robot_is_held_when_even_the_latent_is_not_finite(permissive):
 
 
 def test_hold_is_zero_motion_or_the_nearest_the_range_allows(policy):
-    torch.testing.assert_close(
-        policy.model.units.hold(torch.zeros(2, 2)), torch.tensor([[0.0, 1.0]] * 2)
-    )  # the speed never varies
-    policy.model.units.action_low[:], policy.model.units.action_high[:] = (
-        torch.tensor([0.2, 1.0]),
-        torch.tensor([0.9, 1.0]),
-    )
-    torch.testing.assert_close(policy.model.units.hold(torch.zeros(1, 2)), torch.tensor([[0.2, 1.0]]))
+    assert policy.model.units.hold(torch.zeros(2, 2)).tolist() == [[0.0, 1.0]] * 2  # the speed never varies
+    forward = replace(policy.config.trained_on, action_low=[0.25, 1.0], action_high=[0.75, 1.0])
+    assert Units(forward, []).hold(torch.zeros(1, 2)).tolist() == [[0.25, 1.0]]
 
 
 def test_monitor_mode_lets_everything_through_and_reports(strict):

@@ -16,7 +16,7 @@ from lerobot_latentsafe.datasets.build_cache import build_frame_cache
 from lerobot_latentsafe.datasets.frame_cache import FrameCache, FrameCacheError
 from lerobot_latentsafe.encoders.patch_encoders import EncoderError
 from lerobot_latentsafe.encoders.perception import EncoderMismatchError
-from lerobot_latentsafe.encoders.pictures import to_model_images
+from lerobot_latentsafe.pictures import to_model_images
 
 
 @pytest.fixture(scope="module")

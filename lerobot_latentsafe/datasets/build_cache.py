@@ -41,7 +41,7 @@ from lerobot_latentsafe.datasets.frame_cache import (
 from lerobot_latentsafe.datasets.label_places import sidecar_path, specifications_of
 from lerobot_latentsafe.datasets.labels import Content, Sidecar, all_labels
 from lerobot_latentsafe.encoders.perception import Perception, PerceptionConfig
-from lerobot_latentsafe.encoders.pictures import to_model_images
+from lerobot_latentsafe.pictures import to_model_images
 from lerobot_latentsafe.runtime.files import (
     allocate,
     keep_room,

@@ -14,7 +14,7 @@ from lerobot_latentsafe.datasets.contract import Contract
 from lerobot_latentsafe.datasets.frame_cache import FOLDER, FrameCache, FrameCacheError
 from lerobot_latentsafe.datasets.labels import FailureLabels
 from lerobot_latentsafe.datasets.renaming import rename_command
-from lerobot_latentsafe.encoders.pictures import check_proportions
+from lerobot_latentsafe.pictures import check_proportions
 from lerobot_latentsafe.units import Units
 
 

@@ -62,12 +62,18 @@ def recorded(meta: LeRobotDatasetMetadata, episodes: list[int], cameras: list[st
         yield Recorded(pictures, state, action, torch.zeros(len(state)))
 
 
+def observations(episode: Recorded) -> Iterator[dict[str, Tensor]]:
+    """What a policy sees at each tick of an episode: LeRobot batches of one."""
+    for t in range(len(episode)):
+        seen = {key: pictures[t : t + 1].float() / 255.0 for key, pictures in episode.pictures.items()}
+        yield {**seen, OBS_STATE: episode.state[t : t + 1]}
+
+
 def replayed(shield: Shield, episode: Recorded) -> Iterator[FilterDecision]:
     """What a shield decides along an episode, as if each action were proposed when it was recorded."""
     shield.reset()
-    for t in range(len(episode)):
-        seen = {key: pictures[t : t + 1].float() / 255.0 for key, pictures in episode.pictures.items()}
-        yield shield({**seen, OBS_STATE: episode.state[t : t + 1]}, episode.action[t : t + 1], float(episode.age_s[t]))
+    for t, seen in enumerate(observations(episode)):
+        yield shield(seen, episode.action[t : t + 1], float(episode.age_s[t]))
         shield.was_executed(episode.action[t : t + 1])  # the recording goes on as it did
 
 

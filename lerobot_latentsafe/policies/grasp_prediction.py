@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from tqdm import trange
 
 from lerobot_latentsafe.encoders.perception import Perception, PerceptionConfig
-from lerobot_latentsafe.encoders.pictures import to_model_images
+from lerobot_latentsafe.pictures import to_model_images
 
 KEYPOINTS, HIDDEN, DROPOUT = 16, 128, 0.1
 STEPS, LEARNING_RATE = 4000, 3e-3

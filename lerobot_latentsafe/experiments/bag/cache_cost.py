@@ -17,9 +17,9 @@ from lerobot.scripts import lerobot_train
 
 from lerobot_latentsafe.datasets.build_cache import eight_bits
 from lerobot_latentsafe.datasets.frame_cache import FOLDER, MANIFEST, FrameCache, dataset_fingerprint, scale_file
-from lerobot_latentsafe.encoders.pictures import to_model_images
 from lerobot_latentsafe.evaluation.statistics import provenance
 from lerobot_latentsafe.experiments.timing import cpu_seconds, ratio, spread
+from lerobot_latentsafe.pictures import to_model_images
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
 
 COPIES = 10

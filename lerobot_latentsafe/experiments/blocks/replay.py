@@ -14,12 +14,12 @@ from lerobot_latentsafe.datasets.clips import ClipReader
 from lerobot_latentsafe.datasets.contract import Contract
 from lerobot_latentsafe.datasets.frame_cache import FOLDER, FrameCache
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE, FailureLabels
-from lerobot_latentsafe.encoders.pictures import to_model_images
 from lerobot_latentsafe.envs.franka_env import FrankaEnv
 from lerobot_latentsafe.evaluation.rollouts import Choice, steps
 from lerobot_latentsafe.experiments.blocks.worlds import EnvironmentsWorld
 from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES, action_limits
 from lerobot_latentsafe.franka.scene import FrankaScene
+from lerobot_latentsafe.pictures import to_model_images
 from lerobot_latentsafe.policies.dreamer.behavior import TERMS
 from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
 from lerobot_latentsafe.runtime.files import allocate, replacing_folder

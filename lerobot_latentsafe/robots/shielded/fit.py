@@ -4,7 +4,7 @@ from lerobot.robots.robot import Robot
 from lerobot.utils.constants import OBS_IMAGES
 
 from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
-from lerobot_latentsafe.encoders.pictures import check_proportions
+from lerobot_latentsafe.pictures import check_proportions
 from lerobot_latentsafe.units import TrainedOn
 
 

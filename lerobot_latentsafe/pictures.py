@@ -18,10 +18,15 @@ def to_model_images(images: Tensor, size: int) -> Tensor:
     if images.shape[-3] == 1:
         images = images.expand(*images.shape[:-3], 3, *images.shape[-2:])
     scale, images = (1.0, images.float()) if images.dtype == torch.uint8 else (255.0, images)
-    if images.shape[-2:] != (size, size):
-        rows, columns = (_averages(n, size).to(images) for n in images.shape[-2:])
-        images = rows @ images @ columns.T
-    return (images * scale + 1e-3).round() / 255.0  # the offset keeps x.5 from rounding by float noise
+    return (averaged(images, size) * scale + 1e-3).round() / 255.0  # the offset keeps x.5 from rounding by float noise
+
+
+def averaged(images: Tensor, size: int) -> Tensor:
+    """Float pictures (..., H, W), area-averaged to (..., size, size)."""
+    if images.shape[-2:] == (size, size):
+        return images
+    rows, columns = (_averages(n, size).to(images) for n in images.shape[-2:])
+    return rows @ images @ columns.T
 
 
 @functools.cache
