@@ -15,7 +15,7 @@ from lerobot_latentsafe.datasets import build_cache
 from lerobot_latentsafe.datasets.build_cache import build_frame_cache
 from lerobot_latentsafe.datasets.frame_cache import FrameCache, FrameCacheError
 from lerobot_latentsafe.encoders.patch_encoders import EncoderError
-from lerobot_latentsafe.encoders.perception import EncoderMismatchError
+from lerobot_latentsafe.encoders.perception import EncoderMismatchError, PatchBasis
 from lerobot_latentsafe.pictures import to_model_images
 
 
@@ -177,3 +177,67 @@ def test_cache_of_another_version_says_so(token_root, tmp_path):
     tiny.rewrite_json(copy / "frame_cache" / "manifest.json", version=1)
     with pytest.raises(FrameCacheError, match=r"is of version 1, this package reads version 2; delete it"):
         FrameCache.open(copy)
+
+
+# -- components that stand for tokens ---
+
+
+@pytest.fixture(scope="module")
+def component_root(dataset, tmp_path_factory):
+    root = tmp_path_factory.mktemp("data") / "components"
+    build_frame_cache(dataset, root, tiny.TOKEN_SIZE, tiny.tokens(config=tiny.perception_config(token_components=6)))
+    return root
+
+
+def dino_wm_of(root, **changes):
+    perception = tiny.perception_config(**changes)
+    world_model = tiny.dino_wm_config(perception=perception, frame_token=True, merge_patches=2)
+    return tiny.new_policy(tiny.metadata(root), world_model=world_model).model.world_model
+
+
+def test_cached_components_are_those_at_deployment(component_root, dataset):
+    model, index = dino_wm_of(component_root), np.array([0, 5, 41])
+    images = torch.stack([dataset[int(i)]["observation.image"] for i in index])
+    seen = model.perceive({"observation.image": to_model_images(images, tiny.TOKEN_SIZE)})
+    cached, _ = FrameCache.open(component_root).frames(index)
+    for name in ("tokens", "vector"):
+        torch.testing.assert_close(cached[name], seen[name], rtol=1e-3, atol=1e-3)
+    assert cached["tokens"].shape == (3, 4, 6) and model.config.perception.token_components == 6
+
+
+def test_the_more_components_the_nearer_to_the_tokens(dataset, token_root, component_root):
+    whole = FrameCache.open(token_root).frames(np.arange(50))[0]["tokens"]
+    errors = []
+    for n in (1, 6, 112):
+        basis = PatchBasis(1, 112, n)
+        basis.fit(whole)
+        errors.append(float((basis.lift(basis(whole)) - whole).norm() / (whole - whole.mean((0, 1))).norm()))
+    assert errors[0] > errors[1] > errors[2] and errors[2] < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("cache", "asked", "said"),
+    [
+        ("component_root", {"token_components": 8}, r"token_components 6, .* made for 8.*--token_components"),
+        ("component_root", {"token_components": 0}, r"token_components 6, .* made for 0"),
+        ("component_root", {"components": 5}, "8 components of 448 numbers a frame, expected 5"),
+    ],
+)
+def test_caches_of_other_components_are_refused(request, cache, asked, said):
+    with pytest.raises(EncoderMismatchError, match=said):
+        dino_wm_of(request.getfixturevalue(cache), **asked)
+
+
+def test_more_components_than_a_token_has_are_refused(dataset, tmp_path):
+    recipe = tiny.tokens(config=tiny.perception_config(token_components=113))
+    with pytest.raises(ValueError, match="113, and this encoder's tokens have 112 numbers"):
+        build_frame_cache(dataset, tmp_path / "new", tiny.TOKEN_SIZE, recipe)
+
+
+def test_a_basis_of_as_many_components_is_shared(dataset, component_root, tmp_path):
+    with pytest.raises(FrameCacheError, match=r"--token_components is 3, and the cache in .* keeps 6"):
+        few = tiny.tokens(config=tiny.perception_config(token_components=3), basis_from=component_root)
+        build_frame_cache(dataset, tmp_path / "few", tiny.TOKEN_SIZE, few)
+    build_frame_cache(dataset, tmp_path / "whole", tiny.TOKEN_SIZE, tiny.tokens(basis_from=component_root))
+    manifests = [FrameCache.open(root).manifest for root in (component_root, tmp_path / "whole")]
+    assert manifests[0]["basis_hash"] == manifests[1]["basis_hash"] and manifests[1]["token_components"] == 0

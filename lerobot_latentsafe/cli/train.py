@@ -6,7 +6,8 @@ from pathlib import Path
 
 from lerobot_latentsafe.calibration import calibrate, check_options, episode_values, store
 from lerobot_latentsafe.cli.options import CACHE_THEM, DatasetSource, PolicySource
-from lerobot_latentsafe.datasets.build_cache import TOKEN_TYPES, Pictures, Tokens, build_frame_cache
+from lerobot_latentsafe.datasets.build_cache import TOKEN_COMPONENTS, TOKEN_TYPES, Pictures, Tokens, build_frame_cache
+from lerobot_latentsafe.datasets.frame_cache import FrameCache
 from lerobot_latentsafe.encoders.perception import PerceptionConfig
 from lerobot_latentsafe.runtime import distributed
 from lerobot_latentsafe.runtime.files import replacing_folder
@@ -33,6 +34,9 @@ class Cache:
     """Pixels; by default 32, or 96 with an encoder."""
     encoder: str | None = None
     """auto, dinov2, dinov2_registers, dinov3, efficientnet_lite0, a folder or a Hub id."""
+    token_components: int | None = None
+    """Principal components that stand for each camera's token of a patch, a sixth of the bytes; 0: whole tokens, as the
+    published DINO-WM reads them. By default 16, or as many as --basis_from has."""
     dtype: str = "float16"
     """How tokens are stored: float16, or int8 with a scale for each token."""
     basis_from: Path | None = None
@@ -40,6 +44,7 @@ class Cache:
 
     def __post_init__(self) -> None:
         require_at_least("--image_size", self.image_size, 1)
+        require_at_least("--token_components", self.token_components, 0)
         if self.dtype not in TOKEN_TYPES:
             raise ValueError(f"--dtype is {self.dtype!r}; expected {' or '.join(TOKEN_TYPES)}")
 
@@ -48,13 +53,20 @@ class Cache:
         size, recipe = 96 if self.encoder else 32, Pictures
         size = size if self.image_size is None else self.image_size
         if self.encoder:
-            config = PerceptionConfig(encoder=self.encoder)
+            config = PerceptionConfig(encoder=self.encoder, token_components=self._token_components())
             recipe = partial(Tokens, config=config, dtype=self.dtype, basis_from=self.basis_from)
         cache = build_frame_cache(self.dataset.opened(), self.output_dir, size, recipe, self.dataset.episodes)
         if cache is None:
             return  # another process finishes
         print(f"{cache.manifest['n_frames']} frames at {size} px in {self.output_dir}")
         print(f"train with --dataset.repo_id={cache.manifest['repo_id']}_cache --dataset.root={self.output_dir}")
+
+    def _token_components(self) -> int:
+        if self.token_components is not None:
+            return self.token_components
+        if self.basis_from is None:
+            return TOKEN_COMPONENTS
+        return FrameCache.open(self.basis_from).manifest.get("token_components", 0)
 
 
 @dataclass

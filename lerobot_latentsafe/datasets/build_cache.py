@@ -21,7 +21,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.dataset_tools import delete_episodes, remove_feature
 from lerobot.datasets.io_utils import write_stats
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 from torch import Tensor
 from tqdm import tqdm
 
@@ -56,6 +56,8 @@ from lerobot_latentsafe.runtime.options import require_at_least
 
 LAYOUT, DONE = "layout.json", "done.npy"
 TOKEN_TYPES = ("float16", "int8")
+TOKEN_COMPONENTS = 16
+"""Principal components of each camera's token of a patch that are kept: 78% of the variance of the bag's."""
 ENCODED_AT_ONCE = 8
 """Frames an encoder reads together: few enough for its activations to stay in a CPU's cache."""
 TOGETHER = 2**21
@@ -123,7 +125,7 @@ class Pictures:
 
 
 class Tokens:
-    """A frozen encoder's tokens, and the principal components of a frame's.
+    """A frozen encoder's tokens, whole or their principal components, and the principal components of a frame's.
 
     Args:
         dtype: of the tokens: float16, or int8 with a scale for each token.
@@ -140,7 +142,7 @@ class Tokens:
         n_patches = self.perception.n_patches
         self.arrays = {
             "tokens": ((n_patches, self.perception.token_dim), dtype),
-            "vector": ((config.components,), "float32"),
+            "vector": ((config.components,), "float16"),
         }
         if dtype == "int8":
             self.arrays["tokens.scale"] = ((n_patches, 1), "float16")
@@ -149,6 +151,8 @@ class Tokens:
             "percepts": ["tokens", "vector"],
             "encoder": self.perception.config.encoder,
             "encoder_hash": self.perception.config.encoder_hash,
+            "components": config.components,
+            "token_components": config.token_components or 0,
         }
 
     def prepare(self, folder: Path, see: Sight, n_episodes: int) -> None:
@@ -165,6 +169,12 @@ class Tokens:
                     f"the cache in {self.basis_from} sees {', '.join(sorted(other.manifest['cameras']))}, this dataset "
                     f"has {', '.join(self.perception.image_keys)}; their principal components do not fit"
                 )
+            n, n_other = (manifest.get("token_components", 0) for manifest in (self.manifest, other.manifest))
+            if n not in (0, n_other):
+                raise FrameCacheError(
+                    f"--token_components is {n}, and the cache in {self.basis_from} keeps {n_other}; give the same, or "
+                    "0 for whole tokens"
+                )
             shutil.copyfile(basis_file(self.basis_from), folder / BASIS)
             return
         rng = np.random.default_rng(0)
@@ -174,18 +184,18 @@ class Tokens:
             picked = rng.permutation(see.length(episode))[: -(-SAMPLED_FRAMES // len(episodes))]
             tokens += [self._tokens(images) for images in see.pieces(episode, np.sort(picked).tolist())]
         torch.manual_seed(0)
-        self.perception.basis.fit(torch.cat(tokens))
-        save_file(self.perception.basis.state_dict(), folder / BASIS)
+        self.perception.fit(torch.cat(tokens))
+        save_file(self.perception.components(), folder / BASIS)
 
     def start(self, folder: Path) -> None:
         """Read the principal components, and note their hash."""
-        self.perception.basis.load_state_dict(load_file(folder / BASIS))
+        self.perception.load_basis(folder / BASIS)
         self.manifest["basis_hash"] = hashlib.sha256((folder / BASIS).read_bytes()).hexdigest()[:16]
 
     def perceive(self, images: dict[str, Tensor]) -> dict[str, np.ndarray]:
         """Numbers of some frames: name -> (T, ...)."""
-        tokens = self._tokens(images)
-        vector = self.perception.basis(tokens).numpy()
+        seen = self.perception.kept(self._tokens(images))
+        tokens, vector = seen["tokens"], seen["vector"].half().numpy()
         if self.dtype == "float16":
             return {"tokens": tokens.half().numpy(), "vector": vector}
         rounded, scale = eight_bits(tokens)

@@ -27,12 +27,15 @@ class PerceptionConfig:
         encoder_hash: of its weights; filled in by training, and checked whenever the encoder is loaded again.
         basis_hash: of the principal components, filled in by training.
         components: principal components of a whole frame's tokens.
+        token_components: principal components of a patch, of each camera, that stand for its token; 0: whole tokens;
+            None: what the token cache holds.
     """
 
     encoder: str = "auto"
     encoder_hash: str | None = None
     basis_hash: str | None = None
     components: int = 128
+    token_components: int | None = None
 
     def of_cache(self, manifest: dict) -> "PerceptionConfig":
         """With encoder and principal components of a token cache, if they are not others than known already.
@@ -45,18 +48,19 @@ class PerceptionConfig:
                 "this cache holds pictures, the world model reads an encoder's tokens; build one with "
                 "latentsafe cache --encoder=auto"
             )
+        found = {"token_components": 0, **manifest}  # before there were any, a cache held whole tokens
         for name, remedy in (
             ("encoder_hash", "encode the dataset with that encoder (latentsafe cache --encoder=...)"),
+            ("token_components", "build the cache with as many (latentsafe cache --token_components=...)"),
             ("basis_hash", "build the cache with --basis_from=<the cache that was trained on>"),
         ):
             known = getattr(self, name)
-            if known is not None and known != manifest[name]:
+            if known is not None and known != found.get(name, known):
                 raise EncoderMismatchError(
-                    f"the cache has {name} {manifest[name]}, the world model was trained with {known}; {remedy}, or "
-                    "train anew"
+                    f"the cache has {name} {found[name]}, the world model was made for {known}; {remedy}, or train anew"
                 )
-        adopted = {name: manifest[name] for name in ("encoder", "encoder_hash", "basis_hash")}
-        return replace(self, **adopted)
+        adopted = ("encoder", "encoder_hash", "basis_hash", "token_components")
+        return replace(self, **{name: found[name] for name in adopted})
 
 
 class FrameBasis(nn.Module):
@@ -74,11 +78,7 @@ class FrameBasis(nn.Module):
 
     def forward(self, tokens: Tensor) -> Tensor:
         """Tokens of frames (..., P, C) -> their components (..., K)."""
-        if not self.fitted:
-            raise RuntimeError(
-                "no principal components yet: they come with a token cache. Run latentsafe cache --encoder=auto and "
-                "train on its folder"
-            )
+        _require_fitted(self.fitted)
         return (tokens.flatten(-2) - self.mean) @ self.axes
 
     @torch.no_grad()
@@ -96,8 +96,67 @@ class FrameBasis(nn.Module):
         self.fitted.fill_(True)
 
 
+class PatchBasis(nn.Module):
+    """Principal components of each camera's patch tokens, the first of them of unit variance.
+
+    Tokens (..., P, cameras x C) -> (..., P, cameras x K).
+    """
+
+    mean: Tensor
+    axes: Tensor
+    fitted: Tensor
+
+    def __init__(self, n_cameras: int, token_dim: int, n_components: int):
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(n_cameras, token_dim))
+        self.register_buffer("axes", torch.zeros(n_cameras, token_dim, n_components))
+        self.register_buffer("fitted", torch.zeros((), dtype=torch.bool))
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Whole tokens (..., P, cameras x C) -> their components (..., P, cameras x K)."""
+        _require_fitted(self.fitted)
+        apart = tokens.unflatten(-1, (len(self.mean), -1)) - self.mean
+        return torch.einsum("...nc,nck->...nk", apart, self.axes).flatten(-2)
+
+    def lift(self, components: Tensor) -> Tensor:
+        """The tokens (..., P, cameras x C) nearest to the data's mean that have these components."""
+        variance = 1 / self.axes.square().sum(1, keepdim=True).clamp(min=1e-12)  # axes are orthogonal
+        parts = components.unflatten(-1, (len(self.mean), -1))
+        return (torch.einsum("...nk,nck->...nc", parts, self.axes * variance) + self.mean).flatten(-2)
+
+    @torch.no_grad()
+    def fit(self, tokens: Tensor) -> None:
+        """From a sample of frames' tokens (N, P, cameras x C).
+
+        Raises:
+            ValueError: a token has fewer numbers than there are to be components.
+        """
+        n_cameras, n_inputs, n_components = self.axes.shape
+        if n_components > n_inputs:
+            raise ValueError(
+                f"token_components is {n_components}, and this encoder's tokens have {n_inputs} numbers; give at most "
+                "that many, or 0 for whole tokens"
+            )
+        for camera, flat in enumerate(tokens.float().unflatten(-1, (n_cameras, -1)).flatten(0, 1).unbind(1)):
+            centred = flat - flat.mean(0)
+            variance, axes = torch.linalg.eigh(centred.T @ centred / len(flat))  # ascending
+            self.mean[camera] = flat.mean(0)
+            self.axes[camera] = axes[:, -n_components:].flip(1) / variance[-1].clamp(min=1e-12).sqrt()
+        self.fitted.fill_(True)
+
+
+def _require_fitted(fitted: Tensor) -> None:
+    if not fitted:
+        raise RuntimeError(
+            "no principal components yet: they come with a token cache. Run latentsafe cache --encoder=auto and train "
+            "on its folder"
+        )
+
+
 class Perception(nn.Module):
-    """Images -> {"tokens": (B, P, n_cameras x dim), "vector": (B, components)}; `config` names the encoder found.
+    """Images -> {"tokens": (B, P, token_dim), "vector": (B, components)}; `config` names the encoder found.
+
+    Tokens are whole, a patch of each camera side by side, or each camera's `token_components`.
 
     The encoder's weights are not part of a checkpoint; its name and hash in the configuration are.
     """
@@ -112,9 +171,11 @@ class Perception(nn.Module):
         self.config = replace(config, encoder=encoder.name, encoder_hash=encoder.weights_hash())
         self.encoder_hash = self.config.encoder_hash
         self._encoder = [encoder]  # in a list, so that its weights are not ours
-        self.n_patches = (image_size // encoder.patch) ** 2
-        self.token_dim = encoder.dim * len(self.image_keys)
-        self.basis = FrameBasis(self.n_patches * self.token_dim, config.components)
+        self.n_patches, n_cameras = (image_size // encoder.patch) ** 2, len(self.image_keys)
+        self.basis = FrameBasis(self.n_patches * encoder.dim * n_cameras, config.components)
+        n_kept = config.token_components or 0
+        self.patches = PatchBasis(n_cameras, encoder.dim, n_kept) if n_kept else None
+        self.token_dim = n_cameras * (n_kept or encoder.dim)
 
     @property
     def encoder(self) -> PatchEncoder:
@@ -122,7 +183,7 @@ class Perception(nn.Module):
         return self._encoder[0]
 
     def tokens(self, images: dict[str, Tensor]) -> Tensor:
-        """Camera key -> (B, 3, S, S) in [0, 1] to tokens (B, P, n_cameras x dim), a patch of each side by side."""
+        """Camera key -> (B, 3, S, S) in [0, 1] to whole tokens (B, P, n_cameras x dim)."""
         together = torch.cat([images[key] for key in self.image_keys])
         key = self.encoder_hash, len(self.image_keys), together.device
         known, tokens = self._latest.get(key, (None, None))
@@ -135,11 +196,34 @@ class Perception(nn.Module):
             self._latest[key] = together, tokens
         return tokens
 
+    def fit(self, tokens: Tensor) -> None:
+        """Principal components of a sample of whole tokens (N, P, n_cameras x dim)."""
+        self.basis.fit(tokens)
+        if self.patches is not None:
+            self.patches.fit(tokens)
+
+    def components(self) -> dict[str, Tensor]:
+        """All principal components, as `load_basis` reads them from a file."""
+        kept = {} if self.patches is None else {f"patches.{key}": t for key, t in self.patches.state_dict().items()}
+        return {**self.basis.state_dict(), **kept}
+
     def load_basis(self, file: Path) -> None:
         """Principal components from a file of a token cache."""
-        self.basis.load_state_dict(load_file(file))
+        found = load_file(file)
+        if found["axes"].shape != self.basis.axes.shape:
+            (there, n_there), (here, n_here) = found["axes"].shape, self.basis.axes.shape
+            raise EncoderMismatchError(
+                f"{file} holds {n_there} components of {there} numbers a frame, expected {n_here} of {here}; build the "
+                "cache at this image size and with as many, or set world_model.perception.components"
+            )
+        self.basis.load_state_dict({key: found[key] for key in self.basis.state_dict()})
+        if self.patches is not None:
+            self.patches.load_state_dict({key: found[f"patches.{key}"] for key in self.patches.state_dict()})
 
     def forward(self, images: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Tokens of frames (..., P, C) -> their components (..., K)."""
-        tokens = self.tokens(images)
-        return {"tokens": tokens, "vector": self.basis(tokens)}
+        """Camera key -> (B, 3, S, S) in [0, 1] to what is kept of the frames' tokens."""
+        return self.kept(self.tokens(images))
+
+    def kept(self, tokens: Tensor) -> dict[str, Tensor]:
+        """Whole tokens (B, P, n_cameras x dim) -> what is kept of them, by name."""
+        return {"tokens": tokens if self.patches is None else self.patches(tokens), "vector": self.basis(tokens)}
