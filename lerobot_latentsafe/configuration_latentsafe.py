@@ -133,13 +133,14 @@ class LatentSafeConfig(PreTrainedConfig):
 
     @property
     def observation_delta_indices(self) -> list[int] | None:
-        """Frames t .. t + T - 1; with a frame cache the policy cuts the window itself, from `index`."""
-        return None if self.frame_cache else list(range(self.world_model.clip_length))
+        """The frames of a clip; with a frame cache the policy cuts them itself, from `index`."""
+        sizes = self.world_model
+        return None if self.frame_cache else [sizes.frame_skip * t for t in range(sizes.clip_length)]
 
     @property
-    def action_delta_indices(self) -> list[int] | None:
-        """The action that led to each frame: LeRobot's frames are (o_t, a_t taken after o_t)."""
-        return None if self.frame_cache else list(range(-1, self.world_model.clip_length - 1))
+    def action_delta_indices(self) -> None:
+        """Numbers are looked up beside the dataset, from `index`."""
+        return None
 
     @property
     def reward_delta_indices(self) -> None:

@@ -73,7 +73,7 @@ class LatentSafePolicy(PreTrainedPolicy):
             data = adopt(config, dataset_meta)
         self.model = model or SafetyModel(config)
         config.validate_features()
-        self.reader = None if data is None else data.reader(config.world_model.clip_length, self.model.units)
+        self.reader = None if data is None else data.reader(config.world_model, self.model.units)
         if data is not None and data.cache is not None:
             self.model.world_model.load_basis(Path(data.frame_cache))
         setattr(self, NOT_AVERAGED, self._never_averaged())

@@ -40,9 +40,9 @@ class LatentImagination:
         self.world_model, self.failure_margin, self.frozen, self.sampled = world_model, margin, frozen, sampled
 
     def step(self, latent: Latent, action: Tensor) -> Latent:
-        """Next latent under actions (B, A) in [-1, 1]."""
+        """Next latent under actions (B, A) in [-1, 1], each held for all ticks of a step."""
         step = self.world_model.sample_step if self.sampled else self.world_model.step
-        return step(latent, action)
+        return step(latent, action.repeat(1, self.world_model.config.frame_skip))
 
     def features(self, latent: Latent) -> Tensor:
         """(B, D), what actor and critic read."""
@@ -58,7 +58,8 @@ class LatentImagination:
 
     def complete(self, latent: Latent, action: Tensor) -> Tensor:
         """The action (B, A) with the frozen commands as they were before this latent."""
-        return torch.where(self.frozen.to(action.device), latent["action"], action)
+        before = latent["action"][:, -action.shape[-1] :]  # of the last tick
+        return torch.where(self.frozen.to(action.device), before, action)
 
 
 class SafetyModel(nn.Module):
@@ -87,7 +88,7 @@ class SafetyModel(nn.Module):
             )
         self.config = config
         self.units = Units(trained_on, config.fallback.frozen_commands)
-        sizes = len(trained_on.state_mean), len(trained_on.action_low)
+        sizes = len(trained_on.state_mean), len(trained_on.action_low) * config.world_model.frame_skip
         with warnings.catch_warnings():  # without proprioception some layers have no inputs
             warnings.filterwarnings("ignore", "Initializing zero-element tensors")
             self.world_model = config.world_model.build(trained_on.cameras, *sizes)
@@ -185,7 +186,8 @@ class SafetyModel(nn.Module):
             margin = self.imagination.margin(latent)
             return margin, self.imagination.complete(latent, still.expand(len(margin), -1))
         critic = self.critic if law.name in BACKUPS else None
-        return look_ahead(self.imagination, latent, self.critic.held_actions(still), law.lookahead, critic)
+        horizon = self.config.world_model.steps(law.lookahead)
+        return look_ahead(self.imagination, latent, self.critic.held_actions(still), horizon, critic)
 
     def worst(self, margin: Tensor, value: Tensor) -> Tensor:
         """The value of going through a margin l to a latent of some value, all (...,): Eq. 5 undiscounted."""

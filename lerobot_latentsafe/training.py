@@ -148,7 +148,7 @@ def load_with_cache(path: str | Path, dataset_meta, seed: int = 0) -> tuple[Late
     data = FilterData.open(dataset_meta, specification, None, size, trained_on.cameras)
     adopt_dataset(trained_on, data.contract)
     data.check_cameras({key: config.input_features[key].shape for key in data.cameras})
-    reader = data.reader(config.world_model.clip_length, policy.model.units)
+    reader = data.reader(config.world_model, policy.model.units)
     reader.require_cache()
     config.world_model.of_cache(data.cache.manifest)
     return policy, reader

@@ -299,8 +299,13 @@ class Units(nn.Module):
         return torch.full((n, len(self.action_low)), torch.nan, device=self.device)
 
     def first_action(self, action: Tensor) -> Tensor:
-        """What counts as having led to the first frame of an episode: no motion, frozen commands as in `action`."""
-        return torch.where(self.frozen, action, 0.0)
+        """What counts as having led to the first frame of an episode: no motion, frozen commands as in `action`.
+
+        Args:
+            action: (..., A), or of several ticks side by side (..., K A).
+        """
+        ticks = action.unflatten(-1, (-1, len(self.frozen)))
+        return torch.where(self.frozen, ticks, 0.0).flatten(-2)
 
     # -- in range ---
 

@@ -1,5 +1,7 @@
 """Alignment of actions, images and labels, on a dataset whose entries count the frames."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import tiny
@@ -48,10 +50,11 @@ def record_counting(root, width=2):
     return root
 
 
-def reading(root):
+def reading(root, **sizes):
     """Reads clips of a counting dataset by the frame they start at; `.policy` is whom they are read for."""
     meta = tiny.metadata(root, "me/counting")
-    policy = tiny.new_policy(meta, world_model=tiny.rssm_config(image_size=8), fallback_action_candidates=None)
+    world_model = tiny.rssm_config(image_size=8, **sizes)
+    policy = tiny.new_policy(meta, world_model=world_model, fallback_action_candidates=None)
     windows = resolve_delta_timestamps(policy.config, meta)
     dataset = LeRobotDataset("me/counting", root=root, delta_timestamps=windows)
 
@@ -127,6 +130,39 @@ def test_what_is_not_valid_is_not_learned_from(clip_at, monkeypatch):
         torch.manual_seed(0)
         losses.append(policy.forward({})[0].item())
     assert not clip.valid.all() and losses[0] == losses[1]
+
+
+@pytest.mark.parametrize("cached", [False, True])
+def test_every_third_frame_is_led_to_by_three_actions(counting_root, tmp_path, cached):
+    root = counting_root
+    if cached:
+        root = tmp_path / "cache"
+        build_frame_cache(LeRobotDataset("me/counting", root=counting_root), root, 8)
+    read = reading(root, frame_skip=3, clip_length=4)
+    clip, units = read(0, 1, int(FIRST[1]) + 3), read.policy.model.units
+    assert clip.action.shape == (3, 4, 6) and clip.state.shape == (3, 4, 2)
+    for row, start in enumerate((0, 1, int(FIRST[1]) + 3)):
+        frames = [start + 3 * t for t in range(4)]
+        inside = [f for f in frames if f < (FIRST[1] if start < FIRST[1] else N)]
+        assert clip.valid[row].tolist() == [f in inside for f in frames]
+        state = (clip.state[row] * units.state_std + units.state_mean)[: len(inside), 0]
+        np.testing.assert_allclose(state, inside, atol=1e-4)
+        pictures = clip.percepts["observation.image"][row, : len(inside), 0, 4, 4] * 255
+        np.testing.assert_allclose(pictures, [10 * f for f in inside], atol=1e-3)
+        for t, frame in enumerate(inside[1:], 1):  # the actions of the three frames before, the earliest first
+            taken = units.denormalise_action(clip.action[row, t].view(3, 2))[:, 0]
+            np.testing.assert_allclose(taken, [100 + frame - 3, 100 + frame - 2, 100 + frame - 1], atol=1e-4)
+    assert (clip.action[:, 0] == 0).all()
+
+
+def test_a_failure_between_two_frames_counts(counting_root, tmp_path):
+    build_frame_cache(LeRobotDataset("me/counting", root=counting_root), tmp_path / "cache", 8)
+    reader = reading(tmp_path / "cache", frame_skip=3, clip_length=3).policy.reader
+    failing = np.zeros(N, np.int64)
+    failing[4] = 1  # between frames 3 and 6
+    reader.labels = replace(reader.labels, failure=failing)
+    clip = reader.cut(np.array([0, 1, 3, 5]), [])
+    assert clip.failure.tolist() == [[0, 0, 1], [0, 1, 0], [0, 1, 0], [0, 0, 0]]
 
 
 def test_actions_and_states_are_scaled_by_the_datasets_range(clip_at):

@@ -25,10 +25,11 @@ class Clip:
     Attributes:
         percepts: what `WorldModel.perceive` makes of each frame's images: name -> (B, T, ...).
         state: (B, T, S) proprioception.
-        action: (B, T, A), the motion that led to each frame, as the world model hears it; none where is_first.
+        action: (B, T, A), the motions that led to each frame since the one before, side by side, as the world model
+            hears them; none where is_first.
         is_first: bool (B, T), frames with no past.
         valid: bool (B, T), False for padding.
-        failure: (B, T), 1 failing, 0 safe, -1 unlabelled.
+        failure: (B, T), 1 failing, by then or since the frame before, 0 safe, -1 unlabelled.
         terminal: (B, T), 1 where the episode is over, 0 where it goes on, -1 unknown.
     """
 
@@ -63,6 +64,13 @@ class Seeing(Protocol):
 
     def images(self, images: Tensor) -> Tensor:
         """Pictures (..., 3, H, W) as the world model takes them."""
+
+
+class WorldModelSizes(Protocol):
+    """What of a world model's configuration says which clips it is trained on."""
+
+    clip_length: int
+    frame_skip: int
 
 
 @dataclass
@@ -132,9 +140,12 @@ class FilterData:
         for key, shape in trained.items():
             check_proportions(key, self.cameras[key], shape)
 
-    def reader(self, length: int, units: Units) -> "ClipReader":
-        """Clips of so many frames in these units."""
-        return ClipReader(self.labels, self.cache, length, units)
+    def reader(self, world_model: WorldModelSizes, units: Units) -> "ClipReader":
+        """Clips for a world model of these sizes, in these units."""
+        numbers, sizes = self.cache or self.contract, world_model
+        return ClipReader(
+            self.labels, self.cache, sizes.clip_length, units, sizes.frame_skip, numbers.state, numbers.action
+        )
 
 
 def _lacks(contract: Contract, missing: list[str], cameras: list[str]) -> str:
@@ -168,20 +179,28 @@ def refuse_transforms(frame_cache: str) -> None:
 
 
 class ClipReader:
-    """Turns the frame indices of a batch into a Clip, with labels looked up beside the dataset.
+    """Turns the frame indices of a batch into a Clip, with numbers and labels looked up beside the dataset.
 
-    A clip holds frames t .. t + T - 1 of one episode. Its first frame has no past (`is_first`), the action before
-    frame t + k is the one LeRobot stores with frame t + k - 1, and what runs past the episode's end is not `valid`.
+    A clip holds frames t, t + K .. t + (T - 1) K of one episode. Its first frame has no past (`is_first`); the actions
+    that led to another are those that LeRobot stores with the K frames before it; what runs past the episode's end is
+    not `valid`.
 
     Args:
         labels: of all frames of the dataset.
         cache: of its frames, or None.
         length: T, of a training clip.
         units: of the filter; clips are made on their device.
+        skip: K.
+        state, action: (N, S) and (N, A) of all frames, in robot units; by default the cache's.
     """
 
-    def __init__(self, labels: FailureLabels, cache: FrameCache | None, length: int, units: Units):
-        self.labels, self.cache, self.length, self.units = labels, cache, length, units
+    def __init__(
+        self, labels: FailureLabels, cache: FrameCache | None, length: int, units: Units, skip: int = 1,
+        state: np.ndarray | None = None, action: np.ndarray | None = None,
+    ):  # fmt: skip
+        self.labels, self.cache, self.length, self.units, self.skip = labels, cache, length, units, skip
+        self.state = cache.state if state is None else state
+        self.action = cache.action if action is None else action
 
     def read(self, batch: dict[str, Tensor], model: Seeing) -> Clip:
         """The clips of a LeRobot training batch."""
@@ -189,16 +208,10 @@ class ClipReader:
         if self.cache is not None:
             return self.cut(index, model.world_model.percept_names)
         eyes = model.world_model
-        valid = ~batch[f"{eyes.image_keys[0]}_is_pad"]
+        window, valid = self._window(index, self.length)
         images = {k: model.images(batch[k]).flatten(0, 1) for k in eyes.image_keys}
         percepts = {k: v.unflatten(0, valid.shape) for k, v in eyes.perceive(images).items()}
-        # LeRobot drops the last axis of features of a single number.
-        action = batch["action"].reshape(*valid.shape, -1)
-        state = action[..., :0]
-        if "observation.state" in batch:
-            state = batch["observation.state"].reshape(*valid.shape, -1)
-        window = np.minimum(index[:, None] + np.arange(self.length), len(self.labels.failure) - 1)
-        return self._assemble(window, percepts, state, action, valid)
+        return self._assemble(window, valid, percepts)
 
     def require_cache(self) -> None:
         """Raise ValueError unless the dataset is cached: only training decodes videos."""
@@ -208,34 +221,50 @@ class ClipReader:
     def cut(self, start: np.ndarray, percept_names: list[str], length: int | None = None) -> Clip:
         """Clips from the frame cache that start at the given frame indices (B,); by default of the training length."""
         self.require_cache()
-        window = start[:, None] + np.arange(length or self.length)
-        inside = np.minimum(window, len(self.labels.episode) - 1)
-        valid = (window == inside) & (self.labels.episode[inside] == self.labels.episode[start][:, None])
-        last = start + valid.sum(1) - 1
-        window = np.minimum(window, last[:, None])
-        percepts, state = self.cache.frames(window, percept_names)
-        percepts = {key: value.to(self.units.device) for key, value in percepts.items()}
-        # Like LeRobot, which clamps to the episode: before its first frame stands the action after it.
-        before = np.maximum(window - 1, 0)
-        before = np.where(self.labels.episode[before] == self.labels.episode[window], before, window)
-        action = torch.from_numpy(self.cache.action[before])
-        return self._assemble(window, percepts, state, action, torch.from_numpy(valid))
+        window, valid = self._window(start, length or self.length)
+        percepts, _ = self.cache.frames(window, percept_names)
+        return self._assemble(window, valid, {key: value.to(self.units.device) for key, value in percepts.items()})
 
-    def _assemble(
-        self, window: np.ndarray, percepts: dict[str, Tensor], state: Tensor, action: Tensor, valid: Tensor
-    ) -> Clip:
-        units, device = self.units, self.units.device
+    def _window(self, start: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarray]:
+        """Frame indices (B, T) from each start on, and whether they are of its episode; if not, they stay at the last
+        that is."""
+        episode = self.labels.episode
+        window = start[:, None] + self.skip * np.arange(length)
+        inside = np.minimum(window, len(episode) - 1)
+        valid = (window == inside) & (episode[inside] == episode[start][:, None])
+        last = start + self.skip * (valid.sum(1) - 1)
+        return np.minimum(window, last[:, None]), valid
+
+    def _since(self, window: np.ndarray) -> np.ndarray:
+        """The K frames before each (B, T, K): like LeRobot, which clamps to the episode, whose first frame stands for
+        those before it."""
+        since, episode = window[..., None] - np.arange(self.skip, 0, -1), self.labels.episode
+        while (outside := (since < 0) | (episode[since] != episode[window][..., None])).any():
+            since = since + outside
+        return since
+
+    def _assemble(self, window: np.ndarray, valid: np.ndarray, percepts: dict[str, Tensor]) -> Clip:
+        units, device, since = self.units, self.units.device, self._since(window)
         is_first = torch.zeros(window.shape, dtype=torch.bool, device=device)
         is_first[:, 0] = True
-        state = state.to(device).float()
-        before = torch.cat([state[:, :1], state[:, :-1]], 1)  # the state at which each action was chosen
-        action = units.heard_action(action.to(device).float(), before)
+        tensor = lambda numbers: torch.from_numpy(np.ascontiguousarray(numbers)).float().to(device)  # noqa: E731
+        action = units.heard_action(tensor(self.action[since]), tensor(self.state[since])).flatten(-2)
+        labels = (self.labels.failure, self.labels.terminal)
+        failure, terminal = (self._by_then(label, window, since) for label in labels)
         return Clip(
             percepts=percepts,
-            state=units.normalise_state(state),
+            state=units.normalise_state(tensor(self.state[window])),
             action=torch.where(is_first[..., None], units.first_action(action), action),
             is_first=is_first,
-            valid=valid.to(device),
-            failure=torch.from_numpy(self.labels.failure[window]).long().to(device),
-            terminal=torch.from_numpy(self.labels.terminal[window]).long().to(device),
+            valid=torch.from_numpy(valid).to(device),
+            failure=failure.to(device),
+            terminal=terminal.to(device),
         )
+
+    @staticmethod
+    def _by_then(label: np.ndarray, window: np.ndarray, since: np.ndarray) -> Tensor:
+        """Labels of frames (B, T): 1 also where it was 1 since the frame before."""
+        found = label[window]
+        between = (label[since[:, 1:, 1:]] == 1).any(-1)  # the frame before and the window's first count by themselves
+        found[:, 1:] = np.where(between, 1, found[:, 1:])
+        return torch.from_numpy(found).long()

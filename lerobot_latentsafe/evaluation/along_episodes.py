@@ -115,6 +115,7 @@ def _batches(frames: DatasetFrames, batch_size: int) -> Iterator[list[int]]:
     yield batch
 
 
+@torch.no_grad()
 def encode_episodes(model: SafetyModel, frames: DatasetFrames, episodes: list[int]) -> tuple[Latent, list[int]]:
     """What the filter makes of a few episodes, filtered from their first frames, side by side.
 
@@ -123,19 +124,38 @@ def encode_episodes(model: SafetyModel, frames: DatasetFrames, episodes: list[in
     """
     seen = [_model_inputs(model, frames, episode) for episode in episodes]
     length = [len(state) for _, state, _ in seen]
-    stack = lambda rows: pad_sequence(rows, batch_first=True).to(model.device)  # noqa: E731
-    valid = torch.arange(max(length)) < torch.tensor(length)[:, None]
+    skip = model.config.world_model.frame_skip
+    longest = -(-max(length) // skip) * skip
+    stack = lambda rows: _padded(rows, longest).to(model.device)  # noqa: E731
     action = stack([action for _, _, action in seen])
-    previous = torch.cat([model.units.first_action(action[:, :1]), action[:, :-1]], 1)
-    is_first = torch.zeros_like(valid)
-    is_first[:, 0] = True
-    unknown = torch.full(valid.shape, -1)
     percepts = {key: stack([row[key] for row, _, _ in seen]) for key in model.world_model.percept_names}
-    clip = Clip(
-        percepts, stack([state for _, state, _ in seen]), previous, is_first.to(model.device), valid, unknown, unknown
-    )
-    with torch.no_grad():
-        return model.world_model.encode(clip), length
+    clip = _every(skip, percepts, stack([state for _, state, _ in seen]), action, model)
+    latents = model.world_model.encode(clip)
+    in_order = lambda t: t.unflatten(0, (-1, skip)).transpose(1, 2).flatten(1, 2)[:, : max(length)]  # noqa: E731
+    return map_latent(latents, in_order), length
+
+
+def _padded(rows: list[Tensor], length: int) -> Tensor:
+    """Rows (T, ...), each with zeros after it: (B, length, ...)."""
+    padded = pad_sequence(rows, batch_first=True)
+    return torch.cat([padded, padded.new_zeros(len(rows), length - padded.shape[1], *padded.shape[2:])], 1)
+
+
+def _every(skip: int, percepts: dict[str, Tensor], state: Tensor, action: Tensor, model: SafetyModel) -> Clip:
+    """Frames of B episodes as clips of every so many, one for each frame to begin with: (B skip, T / skip, ...).
+
+    Args:
+        percepts, state, action: (B, T, ...), actions those taken after each frame.
+    """
+    apart = lambda t: t.unflatten(1, (-1, skip)).transpose(1, 2).flatten(0, 1)  # noqa: E731
+    ticks = torch.stack([action.roll(n, 1) for n in range(skip, 0, -1)], 2).flatten(2)  # those since the frame before
+    ticks[:, :skip] = model.units.first_action(action[:, :skip].repeat(1, 1, skip))
+    state = apart(state)
+    is_first = torch.zeros(state.shape[:2], dtype=torch.bool, device=state.device)
+    is_first[:, 0] = True
+    unknown = torch.full_like(is_first, -1, dtype=torch.long)
+    percepts = {key: apart(value) for key, value in percepts.items()}
+    return Clip(percepts, state, apart(ticks), is_first, torch.ones_like(is_first), unknown, unknown)
 
 
 def _model_inputs(model: SafetyModel, frames: DatasetFrames, episode: int) -> tuple[dict[str, Tensor], Tensor, Tensor]:

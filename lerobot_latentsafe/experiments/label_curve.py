@@ -56,7 +56,7 @@ class Study:
         self.seen = encode(model, reader, self.first).numpy()
         # A frame's number stands in for its label, so that labels can be put on and taken off later.
         numbered = replace(labels, failure=np.arange(len(self.failure)))
-        numbers = ClipReader(numbered, reader.cache, reader.length, reader.units)
+        numbers = ClipReader(numbered, reader.cache, reader.length, reader.units, reader.skip)
         generator = torch.Generator().manual_seed(0)
         imagined = seen_and_imagined(model, numbers, self.config.clips, generator)
         self.features, self.frame = (column.cpu().numpy() for column in imagined)

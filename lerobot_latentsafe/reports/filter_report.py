@@ -272,12 +272,12 @@ def imagine(
         action: (1, A) in [-1, 1], held on; None asks the fallback policy at every step.
         seen: where to look for pictures; None has the world model decode them.
     """
-    model, images, margins = policy.model.world_model, [], []
+    imagination, images, margins = policy.model.imagination, [], []
     for _ in range(IMAGINED):
         held = policy.model.plan(latent)[1] if action is None else action
-        latent = model.step(latent, held)
+        latent = imagination.step(latent, held)
         images.append(_decoded(policy, latent) if seen is None else seen.nearest(latent))
-        margins.append(policy.model.imagination.margin(latent).item())
+        margins.append(imagination.margin(latent).item())
     return images, margins
 
 

@@ -26,10 +26,21 @@ class WorldModelConfig(draccus.ChoiceRegistry, abc.ABC):
     Attributes:
         image_size: side of the square images the model reads; others are area-averaged to it.
         clip_length: frames of a training window.
+        frame_skip: ticks of the robot in one step of the model, which sees every so many frames and hears as many
+            actions side by side.
     """
 
     image_size: int = 128
     clip_length: int = 64
+    frame_skip: int = 1
+
+    def __post_init__(self) -> None:
+        if self.frame_skip < 1:
+            raise ValueError(f"frame_skip is {self.frame_skip}; expected at least 1 tick a step of the world model")
+
+    def steps(self, ticks: int) -> int:
+        """Steps of the model that cover so many ticks of the robot."""
+        return -(-ticks // self.frame_skip)
 
     @property
     def type(self) -> str:
@@ -68,7 +79,7 @@ class WorldModel(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def step(self, latent: Latent, action: Tensor) -> Latent:
-        """Imagine: next latent (B, ...) under actions (B, A) in [-1, 1]."""
+        """Imagine: next latent (B, ...) under actions (B, A) in [-1, 1], those of `frame_skip` ticks side by side."""
 
     def sample_step(self, latent: Latent, action: Tensor) -> Latent:
         """One of the latents that may come next; a model that knows only one takes that."""

@@ -55,7 +55,7 @@ def _reader(model: SafetyModel, root: Path) -> ClipReader:
     )
     specification, size = config.margin.failure_specification, config.world_model.image_size
     data = FilterData.open(meta, specification, None, size, config.trained_on.cameras)
-    return data.reader(config.world_model.clip_length, model.units)
+    return data.reader(config.world_model, model.units)
 
 
 def outcome(model: SafetyModel, latent: Latent, act: Callable[[Latent, int], Tensor]) -> Tensor:

@@ -93,6 +93,11 @@ class TrainDreamer:
                 raise ValueError(f"--{name}.type is {found!r}; expected {wanted}")
         if self.model.world_model.type != "rssm":
             raise ValueError(f"--model.world_model.type is {self.model.world_model.type!r}; expected 'rssm'")
+        if self.model.world_model.frame_skip != 1:
+            raise ValueError(
+                f"--model.world_model.frame_skip is {self.model.world_model.frame_skip}; a policy that learns in "
+                "imagination acts at every step of it: expected 1"
+            )
         for name, least in LEAST.items():
             require_at_least(f"--{name}", getattr(self, name), least)
         if self.pretraining > self.steps:
