@@ -89,13 +89,14 @@ def test_streaming_equals_the_full_forward(model):
     clip = random_clip(length=12)
     tokens, state = clip.percepts["tokens"], clip.state
     seen = model._frames_seen(clip.is_first)
-    ahead = model._advance(tokens[:, :-1], state[:, :-1], clip.action[:, 1:], seen[:, :-1])
+    known = {"tokens": tokens[:, :-1], "state": state[:, :-1]}
+    ahead = model._advance(known, clip.action[:, 1:], seen[:, :-1]).frames
     latent = model.initial(3)
     for t in range(11):
         latent = model.observe(latent, clip.action[:, t], {"tokens": tokens[:, t]}, state[:, t])
         predicted = model.step(latent, clip.action[:, t + 1])
         for name in ("tokens", "state", "context"):
-            torch.testing.assert_close(predicted[name], getattr(ahead, name)[:, t], atol=1e-5, rtol=0)
+            torch.testing.assert_close(predicted[name], ahead[name][:, t], atol=1e-5, rtol=0)
 
 
 @torch.no_grad()
@@ -192,16 +193,13 @@ def test_padding_and_other_episodes_count_for_nothing(options):
 @torch.no_grad()
 def test_features_of_the_loss_are_those_of_latents_seen_and_then_imagined():
     model, clip = build(observed=3).eval(), random_clip()
-    clip.is_first[1, 6] = True
     features = model.loss(clip)[1]
     encoded = model.encode(clip)
     torch.testing.assert_close(features[:, :3], model.features(encoded)[:, :3], atol=1e-5, rtol=1e-4)
-    torch.testing.assert_close(features[1, 6:], model.features(encoded)[1, 6:], atol=1e-5, rtol=1e-4)
     latent = map_latent(encoded, lambda t: t[:, 2])
     for t in range(3, 8):
         latent = model.step(latent, clip.action[:, t])
-        imagined = [0, 2] if t >= 6 else [0, 1, 2]
-        torch.testing.assert_close(features[imagined, t], model.features(latent)[imagined], atol=1e-5, rtol=1e-4)
+        torch.testing.assert_close(features[:, t], model.features(latent), atol=1e-5, rtol=1e-4)
 
 
 def test_every_parameter_learns_but_the_continuation_until_ends_are_known():
@@ -245,6 +243,68 @@ def test_it_learns_to_obey_the_action():
     assert imagined_error(model, clip, clip.action[torch.randperm(128)]) > 1.5 * true
     copied = (clip.percepts["tokens"][:, 1] - clip.percepts["tokens"][:, -1]).square().mean()
     assert true < 0.5 * copied
+
+
+# -- the recipe: merged patches, a frame token ---
+
+GRID, MERGED = 4, {"merge_patches": 2, "frame_token": True, "token_weight": 0.1}
+
+
+def build_merged(**changes):
+    config = tiny.dino_wm_config(**{**MERGED, **changes})
+    return DinoWM(config, KEYS, STATE_DIM, ACTION_DIM, GRID**2, TOKEN_DIM)
+
+
+def merged_clip(batch=3, length=8):
+    clip = _clip(torch.randn(batch, length, GRID**2, TOKEN_DIM), torch.randn(batch, length, STATE_DIM), None)
+    clip.percepts["vector"] = torch.randn(batch, length, tiny.COMPONENTS)
+    return clip
+
+
+def test_merged_patches_lie_side_by_side_camera_by_camera():
+    model = build_merged()
+    rows, columns = torch.meshgrid(torch.arange(GRID), torch.arange(GRID), indexing="ij")
+    tokens = torch.stack([camera * 100 + 10 * rows + columns for camera in (0, 0, 1, 1)], -1).flatten(0, 1).float()
+    merged = model._merged(tokens[None])[0]
+    assert merged.shape == (4, 4 * TOKEN_DIM)
+    expected = [0, 0, 1, 1, 10, 10, 11, 11, 100, 100, 101, 101, 110, 110, 111, 111]
+    for token, corner in enumerate((0, 2, 20, 22)):
+        assert merged[token].tolist() == [corner + number for number in expected]
+
+
+@pytest.mark.parametrize("conditioning", ["adaln", "concat"])
+@torch.no_grad()
+def test_streaming_with_a_frame_token_equals_the_full_forward(conditioning):
+    model, clip = build_merged(conditioning=conditioning).eval(), merged_clip(length=12)
+    frames = {**model._looked_at(clip.percepts), "state": clip.state}
+    seen = model._frames_seen(clip.is_first)
+    known = {name: values[:, :-1] for name, values in frames.items()}
+    ahead = model._advance(known, clip.action[:, 1:], seen[:, :-1]).frames
+    latent = model.initial(3)
+    for t in range(11):
+        percepts = {name: values[:, t] for name, values in clip.percepts.items()}
+        latent = model.observe(latent, clip.action[:, t], percepts, clip.state[:, t])
+        predicted = model.step(latent, clip.action[:, t + 1])
+        for name in ("tokens", "vector", "state", "context"):
+            torch.testing.assert_close(predicted[name], ahead[name][:, t], atol=1e-5, rtol=0)
+    assert model.features(latent).shape == (3, model.feature_dim) and model.percept_names == ["tokens", "vector"]
+
+
+def test_every_parameter_of_the_recipe_learns():
+    for conditioning in ("adaln", "concat"):
+        model = build_merged(conditioning=conditioning).train()
+        loss, features, metrics = model.loss(merged_clip())
+        (loss + features.square().sum()).backward()
+        idle = {name for name, p in model.named_parameters() if p.grad is None or not p.grad.any()}
+        assert idle and all(name.startswith("continues.") for name in idle)
+        assert {"loss_frame", "loss_frame_open_loop"} <= metrics.keys()
+
+
+def test_a_grid_that_does_not_fall_into_squares_is_refused():
+    with pytest.raises(ValueError, match="9 patches a camera: 2 x 2 of them do not fill"):
+        build(merge_patches=2)
+    with pytest.raises(ValueError, match="12 patches"):
+        DinoWM(tiny.dino_wm_config(merge_patches=2), KEYS, STATE_DIM, ACTION_DIM, 12, TOKEN_DIM)
 
 
 def test_blind_control_sees_nothing():

@@ -48,29 +48,30 @@ def tokens(**changes):
     from functools import partial
 
     from lerobot_latentsafe.datasets.build_cache import Tokens
+
+    return partial(Tokens, **{"config": perception_config(), **changes})
+
+
+def perception_config(**changes):
     from lerobot_latentsafe.encoders.perception import PerceptionConfig
 
-    perception = PerceptionConfig(encoder="efficientnet_lite0", components=COMPONENTS)
-    return partial(Tokens, **{"config": perception, **changes})
+    return PerceptionConfig(**{"encoder": "efficientnet_lite0", "components": COMPONENTS, **changes})
 
 
 def gru_config(**changes):
-    from lerobot_latentsafe.encoders.perception import PerceptionConfig
     from lerobot_latentsafe.world_models import GRUConfig
 
-    perception = PerceptionConfig(encoder="efficientnet_lite0", components=COMPONENTS)
-    sizes = dict(perception=perception, image_size=TOKEN_SIZE, hidden=16, units=16, clip_length=8, observed=3)
+    sizes = dict(perception=perception_config(), image_size=TOKEN_SIZE, hidden=16, units=16, clip_length=8, observed=3)
     return GRUConfig(**{**sizes, **changes})
 
 
 def dino_wm_config(**changes):
-    from lerobot_latentsafe.encoders.perception import PerceptionConfig
     from lerobot_latentsafe.world_models import DinoWMConfig
 
-    perception = PerceptionConfig(encoder="efficientnet_lite0", components=COMPONENTS)
     sizes = dict(
-        perception=perception, image_size=TOKEN_SIZE, clip_length=8, dim=32, depth=2, heads=2, head_dim=8, mlp=32,
-        embedding=4, summary=8,
+        perception=perception_config(), image_size=TOKEN_SIZE, clip_length=8, dim=32, depth=2, heads=2, head_dim=8,
+        mlp=32, embedding=4, summary=8, frame_skip=1, merge_patches=1, frame_token=False, token_weight=1.0,
+        change_weight=0.7, observed=3,
     )  # fmt: skip
     return DinoWMConfig(**{**sizes, **changes})
 

@@ -6,11 +6,18 @@ change. Past frames are there as keys and values (see `frame_transformer.py`): `
 same `step` serves training, imagination and the shield.
 
 As published, with the action concatenated and a one-step loss, such a model ignores the action: from one frame to the
-next hardly anything changes. So by default action and proprioception modulate every layer (AdaLN), the rest of each
-clip is imagined from its start (open loop), and what changes weighs more than what does not.
+next hardly anything changes, and texture that nothing can predict drowns what the action moves. So by default
+
+* action and proprioception modulate every layer (AdaLN);
+* the rest of each clip is imagined from its start (open loop);
+* a step of the model is several ticks of the robot (`frame_skip`);
+* tokens are principal components of what the encoder says, four patches side by side (`merge_patches`);
+* a frame token carries the components of the whole frame, as a class token would, and most of the loss weighs on it.
 """
 
+import math
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -18,11 +25,12 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from lerobot_latentsafe.datasets.clips import Clip
+from lerobot_latentsafe.datasets.frame_cache import basis_file
 from lerobot_latentsafe.encoders.perception import Perception, PerceptionConfig
 from lerobot_latentsafe.latent import Latent
 from lerobot_latentsafe.runtime.distributed import from_first_rank, mean_over_ranks
 from lerobot_latentsafe.world_models.base import WorldModelConfig
-from lerobot_latentsafe.world_models.frame_transformer import FrameTransformer, Linear
+from lerobot_latentsafe.world_models.frame_transformer import FrameTransformer
 from lerobot_latentsafe.world_models.patch_summary import PatchSummary
 from lerobot_latentsafe.world_models.termination import TerminationHead
 
@@ -37,7 +45,7 @@ class DinoWMConfig(WorldModelConfig):
     """The default is the compact preset for two cores; `configs/bag_dino_wm_paper.yaml` holds the paper's sizes.
 
     Attributes:
-        perception: the frozen encoder.
+        perception: the frozen encoder, and how many components of its tokens are read.
         history: H, the frames a prediction is made from.
         dim, depth, heads, head_dim, mlp: the transformer's width, layers, attention heads, their width, and the
             hidden width of its feed-forward layers.
@@ -49,26 +57,47 @@ class DinoWMConfig(WorldModelConfig):
         observed: frames of a clip that are seen before the rest is imagined, at most.
         open_loop: weight of the error of what is imagined open loop; 0 is teacher forcing alone, as in the paper.
         change_weight: share of a token error's weight that follows how much the token changes.
+        merge_patches: so many patches a side, side by side, are one token.
+        frame_token: whether a token beside the patches carries the principal components of the whole frame.
+        token_weight, frame_weight: of the errors of patches, and of the frame token.
         blind: see no images, only proprioception: the control that a model which looks must beat.
     """
 
     perception: PerceptionConfig = field(default_factory=PerceptionConfig)
     image_size: int = 96
-    clip_length: int = 9
+    clip_length: int = 10
+    frame_skip: int = 3
     history: int = 3
-    dim: int = 96
-    depth: int = 3
-    heads: int = 3
+    dim: int = 128
+    depth: int = 2
+    heads: int = 4
     head_dim: int = 32
-    mlp: int = 384
+    mlp: int = 256
     conditioning: str = "adaln"
     embedding: int = 10
     decoder_layers: int = 1
     summary: int = 32
-    observed: int = 3
+    observed: int = 4
     open_loop: float = 1.0
-    change_weight: float = 0.7
+    change_weight: float = 0.0
+    merge_patches: int = 2
+    frame_token: bool = True
+    token_weight: float = 0.1
+    frame_weight: float = 1.0
     blind: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.conditioning not in CONDITIONINGS:
+            raise ValueError(f"conditioning is {self.conditioning!r}; expected one of {', '.join(CONDITIONINGS)}")
+        if self.clip_length < 2:
+            raise ValueError(f"clip_length is {self.clip_length}; a prediction needs at least 2 frames")
+        if self.head_dim % 2:
+            raise ValueError(f"head_dim is {self.head_dim}; the rotary embedding turns pairs, give an even number")
+        if self.conditioning == "concat" and self.dim <= 2 * self.embedding:
+            raise ValueError(f"dim is {self.dim}; twice embedding={self.embedding} of it leave nothing for the tokens")
+        if self.merge_patches < 1:
+            raise ValueError(f"merge_patches is {self.merge_patches}; expected 1 (as they are) or more")
 
     def of_cache(self, manifest: dict) -> "DinoWMConfig":
         """With the encoder of a token cache; see the base class."""
@@ -84,12 +113,11 @@ class DinoWMConfig(WorldModelConfig):
 
 
 class _Ahead(NamedTuple):
-    """What follows each of T frames: tokens (B, T, P, C), state (B, T, S), context (B, T, d); and the transformer's
-    keys and values of these frames and the H - 1 before them, a tensor (B, H - 1 + T, P, 2 K) for each layer."""
+    """What follows each of T frames: by name tokens (B, T, P, C), vector (B, T, F), state (B, T, S) and context
+    (B, T, d); and the transformer's keys and values of these frames and the H - 1 before them, a tensor
+    (B, H - 1 + T, P, 2 K) for each layer."""
 
-    tokens: Tensor
-    state: Tensor
-    context: Tensor
+    frames: dict[str, Tensor]
     kept: list[Tensor]
 
 
@@ -97,8 +125,8 @@ def _change_decoder(n_in: int, n_layers: int, n_out: int) -> nn.Sequential:
     """Predicts a change, and starts near the best guess without learning: nothing changes."""
     layers: list[nn.Module] = []
     for _ in range(n_layers - 1):
-        layers += [Linear(n_in, n_in), nn.GELU()]
-    last = Linear(n_in, n_out)
+        layers += [nn.Linear(n_in, n_in), nn.GELU()]
+    last = nn.Linear(n_in, n_out)
     with torch.no_grad():
         last.weight.mul_(0.1)
         last.bias.zero_()
@@ -109,13 +137,14 @@ class DinoWM(TerminationHead):
     """See the module's text. A latent holds
 
         tokens (B, P, C), state (B, S)    of the frame, seen or imagined
+        vector (B, F)                     components of the whole frame, with a frame token; P counts it for past_i
         context (B, d)                    what the frames before said of it: the transformer's output, mean over patches
         seen (B,)                         frames known, this one included, at most H; 0 before the first
         past_i (B, H - 1, P, 2 K)         keys and values of the frames before in layer i
         action (B, A)                     that led here
 
     Args:
-        n_patches, token_dim: P and C.
+        n_patches, token_dim: of the percepts, before patches are merged to P tokens of C numbers.
         perception: what makes tokens of images; without it the model reads tokens only.
     """
 
@@ -126,12 +155,15 @@ class DinoWM(TerminationHead):
         token_dim: int, perception: Perception | None = None,
     ):  # fmt: skip
         super().__init__()
-        _check(config)
         self.config = config if perception is None else replace(config, perception=perception.config)
         self.image_keys, self.action_dim = sorted(image_keys), action_dim
-        self._perception = [perception]  # in a list, so that it is not part of the checkpoint
+        self._perception = [perception]  # in a list, so that the encoder is not part of the checkpoint
+        self.patches = None if perception is None else perception.patches
+        self.basis = None if perception is None or not config.frame_token else perception.basis
+        self._grid = (*_merged_grid(n_patches, config.merge_patches), config.merge_patches)
+        n_tokens, token_dim = self._grid[0] * self._grid[1], token_dim * config.merge_patches**2
         d, width = config.dim, config.summary
-        self._build_inputs(n_patches, token_dim, state_dim)
+        self._build_inputs(n_tokens, token_dim, state_dim)
         condition_dim = d if config.conditioning == "adaln" else None
         self.transformer = FrameTransformer(
             d, config.depth, config.heads, config.head_dim, config.mlp, config.history, condition_dim
@@ -141,12 +173,18 @@ class DinoWM(TerminationHead):
             _change_decoder(d, config.decoder_layers, token_dim // len(image_keys)) for _ in self.image_keys
         )
         self.state_decoder = _change_decoder(d + state_dim + action_dim, config.decoder_layers, state_dim)
-        self.summary = PatchSummary(n_patches, token_dim, width)
+        self.summary = PatchSummary(n_tokens, token_dim, width)
         self.feature_dim = 2 * width + d + state_dim
+        self.sizes = {"tokens": (n_tokens, token_dim), "state": (state_dim,), "context": (d,), "action": (action_dim,)}
+        if config.frame_token:
+            n_components = config.perception.components
+            self.frame_decoder = _change_decoder(d, 2, n_components)
+            self.sizes["vector"] = (n_components,)
+            self.feature_dim += n_components
+        self.seen_names = [name for name in ("tokens", "vector", "state") if name in self.sizes]
         self.continues = nn.Sequential(nn.Linear(self.feature_dim, 64), nn.SiLU(), nn.Linear(64, 1))
-        self.sizes = {"tokens": (n_patches, token_dim), "state": (state_dim,), "context": (d,), "action": (action_dim,)}
 
-    def _build_inputs(self, n_patches: int, token_dim: int, state_dim: int) -> None:
+    def _build_inputs(self, n_tokens: int, token_dim: int, state_dim: int) -> None:
         config, d = self.config, self.config.dim
         width = d
         if config.conditioning == "adaln":
@@ -157,23 +195,34 @@ class DinoWM(TerminationHead):
             self.state_in = nn.Linear(state_dim, config.embedding)
             self.action_in = nn.Linear(self.action_dim, config.embedding)
             width = d - 2 * config.embedding
-        self.token_in = nn.Identity() if width == token_dim else Linear(token_dim, width)
+        self.token_in = nn.Identity() if width == token_dim else nn.Linear(token_dim, width)
+        if config.frame_token:
+            self.frame_in = nn.Linear(config.perception.components, width)
         # As large as the tokens: while patches are hard to tell apart, what an action moves is not learned.
-        self.position = nn.Parameter(torch.randn(n_patches, d))
+        self.position = nn.Parameter(torch.randn(n_tokens + config.frame_token, d))
 
     # -- the model ---
 
     @property
     def percept_names(self) -> list[str]:
-        """Tokens of the frame."""
-        return ["tokens"]
+        """Tokens of the frame, and its components if a token carries them."""
+        return ["tokens", "vector"] if self.config.frame_token else ["tokens"]
+
+    def load_basis(self, root: Path) -> None:
+        """Principal components from a dataset's token cache."""
+        perception = self._perception[0]
+        if perception is not None and (self.basis is not None or self.patches is not None):
+            perception.load_basis(basis_file(root))
 
     def perceive(self, images: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Camera key -> (B, 3, S, S) to tokens (B, P, C)."""
+        """Camera key -> (B, 3, S, S) to tokens (B, patches, ...), and vector (B, F) with a frame token."""
         perception = self._perception[0]
         if perception is None:
             raise RuntimeError("this DINO-WM was made for tokens; build it from its configuration to let it see images")
-        return {"tokens": perception.tokens(images)}
+        if self.basis is None and self.patches is None:
+            return {"tokens": perception.tokens(images)}
+        seen = perception(images)
+        return {name: seen[name] for name in self.percept_names}
 
     def initial(self, batch_size: int) -> Latent:
         """Nothing seen, no frames remembered: (B, ...)."""
@@ -185,45 +234,68 @@ class DinoWM(TerminationHead):
     def step(self, latent: Latent, action: Tensor) -> Latent:
         """Next latent under actions (B, A), from the frame and the H - 1 before it."""
         past = [latent[name] for name in self.past_names]
-        now = (latent["tokens"], latent["state"], action, latent["seen"])
-        return self._next_latent(self._advance(*(t[:, None] for t in now), past=past), 0, latent["seen"], action)
+        now = {name: latent[name][:, None] for name in self.seen_names}
+        ahead = self._advance(now, action[:, None], latent["seen"][:, None], past=past)
+        return self._next_latent(ahead, 0, latent["seen"], action)
 
     def correct(self, predicted: Latent, percepts: dict[str, Tensor], state: Tensor) -> Latent:
-        """The tokens and state that were seen in place of those predicted."""
-        return {**predicted, "tokens": self._looked_at(percepts), "state": state}
+        """What was seen in place of what was predicted."""
+        return {**predicted, **self._looked_at(percepts), "state": state}
 
     def features(self, latent: Latent) -> Tensor:
-        """Summary of the tokens, context and state side by side: (..., D)."""
-        return torch.cat([self.summary(latent["tokens"]), latent["context"], latent["state"]], -1)
+        """Summary of the tokens, context, state and the frame's components side by side: (..., D)."""
+        frame = [latent["vector"]] if self.config.frame_token else []
+        return torch.cat([self.summary(latent["tokens"]), latent["context"], latent["state"], *frame], -1)
 
     def error(self, latent: Latent, percepts: dict[str, Tensor], state: Tensor) -> Tensor:
         """Mean squared error of the tokens (of the state, if blind): (B,)."""
         if self.config.blind:
             return (latent["state"] - state).square().mean(-1)
-        return (latent["tokens"] - percepts["tokens"]).square().mean((-2, -1))
+        return (latent["tokens"] - self._merged(percepts["tokens"])).square().mean((-2, -1))
 
-    def _looked_at(self, percepts: dict[str, Tensor]) -> Tensor:
-        return torch.zeros_like(percepts["tokens"]) if self.config.blind else percepts["tokens"]
+    def _looked_at(self, percepts: dict[str, Tensor]) -> dict[str, Tensor]:
+        """What is seen of frames (..., P, C) and (..., F)."""
+        seen = {name: percepts[name] for name in self.percept_names}
+        seen["tokens"] = self._merged(seen["tokens"])
+        return {name: torch.zeros_like(value) for name, value in seen.items()} if self.config.blind else seen
+
+    def _merged(self, tokens: Tensor) -> Tensor:
+        """Neighbouring patches side by side, camera by camera: (..., patches, cameras x K) -> (..., P, C)."""
+        rows, columns, m = self._grid
+        if m == 1:
+            return tokens
+        apart = tokens.unflatten(-1, (len(self.image_keys), -1)).unflatten(-3, (rows, m, columns, m))
+        return apart.movedim((-6, -4, -2), (-6, -5, -4)).flatten(-4).flatten(-3, -2)
 
     def _advance(
-        self, tokens: Tensor, state: Tensor, action: Tensor, seen: Tensor, *, past: list[Tensor] | None = None
+        self, frames: dict[str, Tensor], action: Tensor, seen: Tensor, *, past: list[Tensor] | None = None
     ) -> _Ahead:
         """One step ahead of each of T frames, under the actions taken there.
 
         Args:
-            tokens (B, T, P, C), state (B, T, S), action (B, T, A); seen (B, T) and past as in the transformer.
+            frames: tokens (B, T, P, C), state (B, T, S) and perhaps vector (B, T, F).
+            action: (B, T, A).
+            seen: (B, T), and past: as in the transformer.
         """
-        x, condition = self._embed(tokens, state, action)
+        x, condition = self._embed(frames, action)
         x, kept = self.transformer(x, seen, past, condition)
-        context = x.mean(-2)
-        tokens = tokens + torch.cat([decoder(x) for decoder in self.decoders], -1)
-        state = state + self.state_decoder(torch.cat([context, state, action], -1))
-        # Of a first frame nothing was known before; what the empty latent led to must not say otherwise.
-        return _Ahead(tokens, state, context * (seen > 0)[..., None], kept)
+        context, state = x.mean(-2), frames["state"]
+        patches = x[..., : frames["tokens"].shape[-2], :]
+        ahead = {
+            "tokens": frames["tokens"] + torch.cat([decoder(patches) for decoder in self.decoders], -1),
+            "state": state + self.state_decoder(torch.cat([context, state, action], -1)),
+            # Of a first frame nothing was known before; what the empty latent led to must not say otherwise.
+            "context": context * (seen > 0)[..., None],
+        }
+        if self.config.frame_token:
+            ahead["vector"] = frames["vector"] + self.frame_decoder(x[..., -1, :])
+        return _Ahead(ahead, kept)
 
-    def _embed(self, tokens: Tensor, state: Tensor, action: Tensor) -> tuple[Tensor, Tensor | None]:
+    def _embed(self, frames: dict[str, Tensor], action: Tensor) -> tuple[Tensor, Tensor | None]:
         """The transformer's input (B, T, P, d), and with AdaLN the condition (B, T, d) of its layers."""
-        x = self.token_in(tokens)
+        x, state = self.token_in(frames["tokens"]), frames["state"]
+        if self.config.frame_token:
+            x = torch.cat([x, self.frame_in(frames["vector"]).unsqueeze(-2)], -2)
         if self.config.conditioning == "adaln":
             return x + self.position, self.condition_in(torch.cat([state, action], -1))
         both = torch.cat([self.state_in(state), self.action_in(action)], -1).unsqueeze(-2)
@@ -233,9 +305,7 @@ class DinoWM(TerminationHead):
         """The latent after frame t, of which `seen` (B,) frames were known, under `action` (B, A)."""
         history = self.config.history
         return {
-            "tokens": ahead.tokens[:, t],
-            "state": ahead.state[:, t],
-            "context": ahead.context[:, t],
+            **{name: values[:, t] for name, values in ahead.frames.items()},
             "seen": (seen + 1).clamp(max=history),
             "action": action,
             **{name: kept[:, t + 1 : t + history] for name, kept in zip(self.past_names, ahead.kept)},
@@ -246,30 +316,33 @@ class DinoWM(TerminationHead):
     def loss(self, clip: Clip) -> tuple[Tensor, Tensor, dict[str, float]]:
         """Errors one step ahead of frames that were seen (teacher forcing), and of the rest imagined open loop.
 
-        The features are those of latents seen and, from where imagination took over, of latents imagined.
+        The features are those of latents seen and, from where imagination took over, of latents imagined. Episodes
+        begin at the first frame of a clip, if anywhere in it.
         """
-        tokens, state = self._looked_at(clip.percepts), clip.state
-        seen = self._frames_seen(clip.is_first)
+        frames = {**self._looked_at(clip.percepts), "state": clip.state}
+        seen, length = self._frames_seen(clip.is_first), clip.state.shape[1]
         goes_on = clip.valid[:, 1:] & clip.valid[:, :-1] & ~clip.is_first[:, 1:]
-        ahead = self._advance(tokens[:, :-1], state[:, :-1], clip.action[:, 1:], seen[:, :-1])
-        context = F.pad(ahead.context, (0, 0, 1, 0)) * (seen > 1)[..., None]
-        frames = {"tokens": tokens, "state": state, "context": context}
+        last = self._last_observed(clip) if self.config.open_loop > 0 else length - 2
+        known = slice(0, last + 1)
+        ahead = self._advance({k: v[:, known] for k, v in frames.items()}, clip.action[:, 1 : last + 2], seen[:, known])
         unit = self._unit_of_change(frames, goes_on)
-        losses = self._errors(ahead.tokens, ahead.state, frames, goes_on, slice(0, -1), unit)
+        begun = {name: value[:, : last + 2] for name, value in frames.items()}
+        losses = self._errors(ahead.frames, begun, goes_on[:, known], slice(0, -1), unit)
         metrics = {f"loss_{name}": value.item() for name, value in losses.items()}
-        loss = sum(losses.values())
+        loss = (last + 1) / (length - 1) * sum(losses.values())
+        context = F.pad(ahead.frames["context"], (0, 0, 1, 0)) * (seen[:, : last + 2] > 1)[..., None]
         if self.config.open_loop > 0:
-            last = self._last_observed(clip)
             imagined = self._imagine(ahead, clip, seen, last)
             alive = goes_on[:, last:].cumprod(1).bool()
-            since = slice(last, last + 1)
-            losses = self._errors(imagined["tokens"], imagined["state"], frames, alive, since, unit)
+            losses = self._errors(imagined, frames, alive, slice(last, last + 1), unit)
             metrics |= {f"loss_{name}_open_loop": value.item() for name, value in losses.items()}
             loss = loss + self.config.open_loop * sum(losses.values())
-            for name, truth in frames.items():
+            for name in self.seen_names:
+                truth = frames[name]
                 ahead_of_last = torch.where(_like(alive, truth), imagined[name], truth[:, last + 1 :])
-                frames[name] = torch.cat([truth[:, : last + 1], ahead_of_last], 1)
-        features = self.features(frames)
+                frames[name] = torch.cat([truth[:, known], ahead_of_last], 1)
+            context = torch.cat([context[:, known], imagined["context"]], 1)
+        features = self.features({**frames, "context": context})
         return loss + self.end_loss(features, clip), features, metrics
 
     def _frames_seen(self, is_first: Tensor) -> Tensor:
@@ -288,36 +361,45 @@ class DinoWM(TerminationHead):
         rows = [self._next_latent(ahead, last, seen[:, last], clip.action[:, last + 1])]
         for t in range(last + 2, clip.state.shape[1]):
             rows.append(self.step(rows[-1], clip.action[:, t]))
-        return {name: torch.stack([row[name] for row in rows], 1) for name in ("tokens", "state", "context")}
+        return {name: torch.stack([row[name] for row in rows], 1) for name in ahead.frames}
 
     def _by_camera(self, tokens: Tensor) -> Tensor:
         """Mean squares of differences (..., P, C) of tokens: (..., P, cameras)."""
         return tokens.square().unflatten(-1, (len(self.image_keys), -1)).mean(-1)
 
     def _unit_of_change(self, frames: dict[str, Tensor], goes_on: Tensor) -> dict[str, Tensor]:
-        """Mean squared change from one frame to the next, of each camera's tokens (cameras,) and of state ()."""
-        tokens, state = (torch.diff(frames[name], dim=1) for name in ("tokens", "state"))
-        change = {"tokens": self._by_camera(tokens).mean(-2), "state": _mean_square(state)}
+        """Mean squared change from one frame to the next, of each camera's tokens (cameras,), of the rest ()."""
+        change = {name: torch.diff(frames[name], dim=1) for name in self.seen_names}
+        change = {
+            name: self._by_camera(value).mean(-2) if name == "tokens" else _mean_square(value)
+            for name, value in change.items()
+        }
         return {name: mean_over_ranks(_mean(value, goes_on)).clamp(min=1e-6) for name, value in change.items()}
 
     def _errors(
-        self, tokens: Tensor, state: Tensor, frames: dict[str, Tensor], counts: Tensor, since: slice,
+        self, predicted: dict[str, Tensor], frames: dict[str, Tensor], counts: Tensor, since: slice,
         unit: dict[str, Tensor],
     ) -> dict[str, Tensor]:  # fmt: skip
         """Mean squared errors of the last N frames of a clip, in units of the change from one frame to the next.
 
         Args:
-            tokens (B, N, P, C), state (B, N, S): predicted.
+            predicted: tokens (B, N, P, C), state (B, N, S) and perhaps vector (B, N, F).
             frames: the clip's.
             counts: bool (B, N), whether a frame is compared.
             since: the frames, N or one, since which a token's change makes it weigh.
         """
-        truth = {name: frames[name][:, -tokens.shape[1] :] for name in ("tokens", "state")}
-        errors = {"state": _mean(_mean_square(state - truth["state"]), counts) / unit["state"]}
-        if not self.config.blind:
-            weight = self._weight(self._by_camera(truth["tokens"] - frames["tokens"][:, since]), counts)
-            error = (self._by_camera(tokens - truth["tokens"]) * weight).mean(-2)
-            errors["tokens"] = (_mean(error, counts) / unit["tokens"]).mean()
+        config, n = self.config, predicted["state"].shape[1]
+        truth = {name: frames[name][:, -n:] for name in self.seen_names}
+        errors = {"state": _mean(_mean_square(predicted["state"] - truth["state"]), counts) / unit["state"]}
+        if config.blind:
+            return errors
+        error = self._by_camera(predicted["tokens"] - truth["tokens"])
+        if config.change_weight > 0:
+            error = error * self._weight(self._by_camera(truth["tokens"] - frames["tokens"][:, since]), counts)
+        errors["tokens"] = config.token_weight * (_mean(error.mean(-2), counts) / unit["tokens"]).mean()
+        if config.frame_token:
+            error = _mean_square(predicted["vector"] - truth["vector"])
+            errors["frame"] = config.frame_weight * _mean(error, counts) / unit["vector"]
         return errors
 
     def _weight(self, change: Tensor, counts: Tensor) -> Tensor:
@@ -344,12 +426,18 @@ def _mean(x: Tensor, counts: Tensor) -> Tensor:
     return (x * _like(counts, x)).sum((0, 1)) / mean_over_ranks(counts.sum()).clamp(min=1e-6)
 
 
-def _check(config: DinoWMConfig) -> None:
-    if config.conditioning not in CONDITIONINGS:
-        raise ValueError(f"conditioning is {config.conditioning!r}; expected one of {', '.join(CONDITIONINGS)}")
-    if config.clip_length < 2:
-        raise ValueError(f"clip_length is {config.clip_length}; a prediction needs at least 2 frames")
-    if config.head_dim % 2:
-        raise ValueError(f"head_dim is {config.head_dim}; the rotary embedding turns pairs, give an even number")
-    if config.conditioning == "concat" and config.dim <= 2 * config.embedding:
-        raise ValueError(f"dim is {config.dim}; twice embedding={config.embedding} of it leave nothing for the tokens")
+def _merged_grid(n_patches: int, m: int) -> tuple[int, int]:
+    """Rows and columns of a square grid of patches when m x m of them are one token.
+
+    Raises:
+        ValueError: the grid is no square, or does not fall into such squares.
+    """
+    side = math.isqrt(n_patches)
+    if m == 1:
+        return n_patches, 1
+    if side * side != n_patches or side % m:
+        raise ValueError(
+            f"merge_patches is {m}, and the encoder makes {n_patches} patches a camera: {m} x {m} of them do not fill "
+            "the grid. Give an image_size whose patches a side are a multiple, or merge_patches=1"
+        )
+    return side // m, side // m

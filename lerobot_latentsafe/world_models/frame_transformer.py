@@ -13,6 +13,10 @@ ROTARY_BASE = 100.0
 """Ages are a few frames, so frequencies go down to 1 / 100 radians a frame only."""
 
 
+MODULATION = 0.02
+"""Standard deviation of the modulation's first weights: from zero, a condition is heard later."""
+
+
 class FrameTransformer(nn.Module):
     """Pre-norm transformer, H frames wide, with a last layer norm.
 
@@ -68,37 +72,19 @@ class FrameTransformer(nn.Module):
         return [self.angle.new_zeros(shape) for _ in self.blocks]
 
 
-class Linear(nn.Linear):
-    """`nn.Linear`, as a convolution of one-pixel kernels where that is faster: many rows on a CPU.
-
-    PyTorch multiplies single-precision matrices by MKL, which leaves half of an AMD core's speed unused, but leaves
-    convolutions to oneDNN, which does not. Of one-pixel kernels that holds only with a stride; along the height of an
-    image one pixel high, a stride changes nothing.
-    """
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(..., n_in) -> (..., n_out)."""
-        rows = x.numel() // self.in_features
-        if rows < 256 or x.device.type != "cpu" or x.dtype != torch.float32:
-            return super().forward(x)
-        pixels = x.reshape(1, 1, rows, self.in_features).permute(0, 3, 1, 2)
-        y = F.conv2d(pixels, self.weight[:, :, None, None], self.bias, stride=(2, 1))
-        return y.permute(0, 2, 3, 1).reshape(*x.shape[:-1], self.out_features)
-
-
 class _Block(nn.Module):
     def __init__(self, dim: int, heads: int, head_dim: int, mlp: int, condition_dim: int | None):
         super().__init__()
         self.heads, self.inner = heads, heads * head_dim
         plain = condition_dim is None
         self.attention_norm = nn.LayerNorm(dim, elementwise_affine=plain)
-        self.qkv = Linear(dim, 3 * self.inner, bias=False)
-        self.out = Linear(self.inner, dim)
+        self.qkv = nn.Linear(dim, 3 * self.inner, bias=False)
+        self.out = nn.Linear(self.inner, dim)
         self.mlp_norm = nn.LayerNorm(dim, elementwise_affine=plain)
-        self.mlp = nn.Sequential(Linear(dim, mlp), nn.GELU(), Linear(mlp, dim))
+        self.mlp = nn.Sequential(nn.Linear(dim, mlp), nn.GELU(), nn.Linear(mlp, dim))
         self.modulation = None if plain else nn.Linear(condition_dim, 6 * dim)
-        if self.modulation is not None:  # start as a plain block: no shift, no scale, open gates
-            nn.init.zeros_(self.modulation.weight)
+        if self.modulation is not None:  # start near a plain block: little shift and scale, open gates
+            nn.init.normal_(self.modulation.weight, std=MODULATION)
             with torch.no_grad():
                 self.modulation.bias.copy_(torch.tensor([0.0, 0.0, 1.0] * 2).repeat_interleave(dim))
 

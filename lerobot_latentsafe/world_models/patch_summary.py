@@ -4,8 +4,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from lerobot_latentsafe.world_models.frame_transformer import Linear
-
 
 class PatchSummary(nn.Module):
     """What is learned of a frame's patches, its mean and maximum over them: tokens (..., P, C) -> (..., 2 width).
@@ -15,7 +13,7 @@ class PatchSummary(nn.Module):
 
     def __init__(self, n_patches: int, token_dim: int, width: int):
         super().__init__()
-        self.enter, self.leave = Linear(token_dim, width), Linear(width, width)
+        self.enter, self.leave = nn.Linear(token_dim, width), nn.Linear(width, width)
         self.position = nn.Parameter(torch.randn(n_patches, width))
         self.norm = nn.LayerNorm(2 * width)
 
