@@ -117,8 +117,10 @@ class BasePolicy:
         queue = self._queue()
         left = len(queue or ())
         action = self._finished(act(self.preprocessor(observation)))
+        if isinstance(action, Tensor):  # a plain one, which is not the policy's to change later
+            action = action.detach().clone().as_subclass(Tensor)
         queue = self._queue()
-        self.planned = self._read(queue) if queue and len(queue) >= left else None
+        self.planned = self._read(queue, action) if queue and len(queue) >= left else None
         return action
 
     def _finished(self, action: Tensor) -> Tensor:
@@ -132,10 +134,16 @@ class BasePolicy:
             return None
         return queued_actions(self.policy) if self.chunks is None else self.chunks.playing
 
-    def _read(self, queue: Sequence[Tensor]) -> Tensor | None:
-        """What is to come, in robot units (B, N, A); None of a policy whose processors take one action at a time."""
+    def _read(self, queue: Sequence[Tensor], action: Tensor) -> Tensor | None:
+        """What is to come after an action (B, A), in robot units (B, N, A).
+
+        None of a policy whose processors take one action at a time, or whose queue holds something else than actions.
+        """
         try:
-            return self._finished(torch.stack([*queue], 1))
+            plan = self._finished(torch.stack([*queue], 1))
+            if plan.dim() != 3 or plan.shape[::2] != action.shape or plan.is_complex():
+                raise ValueError(f"planned {tuple(plan.shape)} of {plan.dtype}, expected (robots, steps, numbers)")
+            return plan
         except Exception as e:
             self._reads_plans = False
             logger.warning("chunks of the base policy (%s) cannot be read: %s", self.config.type, e)

@@ -22,6 +22,7 @@ SEALED = ("world_model", "fallback", "trained_on")
 SEALED_ENTRIES = (
     *SEALED,
     "input_features",
+    "output_features",
     *(f"margin.{name}" for name in ("hidden", "layers", "failure_specification")),
     *(f"reachability.{name}" for name in ("critic_hidden", "actor_hidden", "activation", "components")),
     "normalization_mapping",

@@ -10,6 +10,8 @@ from torch import Tensor
 
 LAWS = ("reachability", "risk", "plan", "margin", "guard")
 MODES = ("filter", "monitor")
+LONG_AGO_MS = 1000.0
+"""What was seen so long ago says nothing of a robot that moves."""
 RECENT = 10
 """Steps whose overrides count for `retreat_after`."""
 
@@ -155,6 +157,8 @@ class LawConfig:
             return f"epsilon is {self.epsilon:g}, and V is never that low: no value makes it act"
         if self.name != "guard" and self.epsilon >= 1:
             return f"epsilon is {self.epsilon:g}, and V is never above that: it always acts"
+        if self.slack_ms >= LONG_AGO_MS:
+            return f"slack_ms is {self.slack_ms:g}: an observation of long ago counts as fresh"
         return None
 
     def passes_nothing_more_than(self, other: "LawConfig") -> bool:

@@ -23,32 +23,11 @@ TEXT = """---
 {header}
 ---
 
-# Latent safety filter
-
-This policy shields another LeRobot policy: it passes the base policy's action while the safety value V of the
-predicted next latent stays above epsilon, and otherwise acts itself to preserve safety
-([Nakamura, Peters, Bajcsy, 2025](https://kensukenk.github.io/latent-safety/)). Alone it is the fallback policy.
-
-**This is not a certified safety device.** Its value is learned from images: it carries no guarantee, least of all
-outside of what its data covered.
+{introduction}
 
 | | |
 |---|---|
-| trained on | {dataset} |
-| robot | {robot} |
-| cameras | {cameras} |
-| rate | {fps} fps |
-| actions (robot units) | {actions} |
-| proprioception | {states} |
-| world model | {world_model} |
-| failure specification | {failure} |
-| stage | {stage} |
-| law | {law} |
-| epsilon | {epsilon} |
-| epsilon was set | {calibration} |
-| fallback | {fallback} |
-| shields | {base} |
-
+{rows}
 ```bash
 pip install lerobot_policy_latentsafe
 lerobot-eval --policy.path={repo_id} --policy.base_policy_path=<your policy> --env.type=...
@@ -60,11 +39,36 @@ have done.
 
 {confusion}{evaluation}## Limits
 
-- V means nothing outside of what the data covered: other cameras, objects, dynamics, lighting. Nothing detects that.
-- It acts at the last moment and with the fallback's full action; it looks for no safe action near the proposed one.
-- {imagination}
+{limits}
 - A policy under it cannot tell that a frame is late or frozen; a robot under it (`latentsafe_shielded`) can.
 """
+
+FILTER = """# Latent safety filter
+
+This policy shields another LeRobot policy: it passes the base policy's action while the safety value V of the
+predicted next latent stays above epsilon, and otherwise acts itself to preserve safety
+([Nakamura, Peters, Bajcsy, 2025](https://kensukenk.github.io/latent-safety/)). Alone it is the fallback policy.
+
+**This is not a certified safety device.** Its value is learned from images: it carries no guarantee, least of all
+outside of what its data covered."""
+
+FILTER_LIMITS = """\
+- V means nothing outside of what the data covered: other cameras, objects, dynamics, lighting. Nothing detects that.
+- It acts at the last moment and with the fallback's full action; it looks for no safe action near the proposed one.
+- {imagination}"""
+
+GUARD = """# Guard
+
+This policy guards another LeRobot policy: it passes the base policy's action while observation, action and time look
+like those of its data, and otherwise has the robot stay. It has no world model, so **there is no safety value V**: it
+knows no failure, and foresees nothing. Alone it stays.
+
+**This is not a certified safety device.** It carries no guarantee."""
+
+GUARD_LIMITS = """\
+- It passes every action that is in range, in time and no jump, wherever that leads.
+- It tells a camera that is dead, frozen or unlike the data's, and only coarsely. Where something is wrong, it stays,
+  safe or not."""
 
 TASK_POLICY_TEXT = """---
 {header}
@@ -150,24 +154,23 @@ def make_model_card(
     config: LatentSafeConfig, dataset_repo_id: str, license: str | None, tags: list[str] | None
 ) -> ModelCard:
     """The card of a filter, from its configuration alone."""
-    law = config.law
+    guards = config.law.name == "guard"
+    limits = GUARD_LIMITS if guards else FILTER_LIMITS.format(imagination=_imagination(config.law.samples))
+    rows = {
+        "trained on": _code(dataset_repo_id),
+        **_robot(config),
+        **({"law": "guard: checks alone, there is no V"} if guards else _judgement(config)),
+        "shields": _code(config.base_policy_path) if config.base_policy_path else "nothing yet",
+    }
     return ModelCard(
         TEXT.format(
             header=_header(dataset_repo_id, license, tags, "latentsafe", "safety-filter"),
-            dataset=_code(dataset_repo_id),
-            **_robot(config),
-            world_model=_world_model(config),
-            failure=_code(config.margin.failure_specification),
-            stage=config.trained_on.stage,
-            law=f"{law.name}, V read after {law.proposal_steps} + {law.lookahead} imagined steps",
-            epsilon=threshold(law),
-            fallback=_said(fallback(law)),
-            calibration=_calibration(config.calibration),
-            base=_code(config.base_policy_path) if config.base_policy_path else "nothing yet",
+            introduction=GUARD if guards else FILTER,
+            rows="".join(f"| {what} | {said} |\n" for what, said in rows.items()),
             repo_id=_repository(config.repo_id, "me/filter"),
-            imagination=_imagination(law.samples),
-            confusion=_confusion(config.calibration),
+            confusion="" if guards else _confusion(config.calibration),
             evaluation=_evaluation(config.evaluation),
+            limits=limits,
         )
     )
 
@@ -178,9 +181,23 @@ def _robot(config: LatentSafeConfig) -> dict[str, str]:
     return {
         "robot": _code(trained_on.robot_type) if trained_on.robot_type else "unknown",
         "cameras": ", ".join(f"{_code(c)} {tuple(config.input_features[c].shape)}" for c in trained_on.cameras or []),
-        "fps": str(trained_on.fps),
-        "actions": ", ".join(_command(c, trained_on) for c in trained_on.commands),
-        "states": ", ".join(map(_said, trained_on.state_names or [])),
+        "rate": f"{trained_on.fps} fps",
+        "actions (robot units)": ", ".join(_command(c, trained_on) for c in trained_on.commands),
+        "proprioception": ", ".join(map(_said, trained_on.state_names or [])),
+    }
+
+
+def _judgement(config: LatentSafeConfig) -> dict[str, str]:
+    """What V is, and what comes of it, in words."""
+    law = config.law
+    return {
+        "world model": _world_model(config),
+        "failure specification": _code(config.margin.failure_specification),
+        "stage": config.trained_on.stage,
+        "law": f"{law.name}, V read after {law.proposal_steps} + {law.lookahead} imagined steps",
+        "epsilon": threshold(law),
+        "epsilon was set": _calibration(config.calibration),
+        "fallback": _said(fallback(law)),
     }
 
 

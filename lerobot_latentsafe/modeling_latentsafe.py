@@ -155,7 +155,7 @@ class LatentSafePolicy(PreTrainedPolicy):
         self.shield.reset()
         self.shield.warm_up()
         if self.base:
-            self._replan(None)
+            self._replan(None, None)
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
@@ -194,40 +194,47 @@ class LatentSafePolicy(PreTrainedPolicy):
         # A policy that is only late keeps its plan where the robots stayed meanwhile.
         stayed = wrong == Reason.DEADLINE_MISSED and self.shield.guard.holding.all()
         if decision.intervened.any() and not stayed:
-            self._replan(decision.action)
+            self._replan(decision.action, self.shield.patience(len(decision.action)))
         return decision
 
     def _ask_base(self, batch: dict[str, Tensor], age_s: float) -> tuple[Tensor | None, Reason]:
         """What the base policy proposes; None, and why, if it gives nothing in time."""
         if self._base_lost:
-            self._replan(None)
+            self._replan(None, self.shield.patience(self._rows(batch)))
         if self._base_lost:
             return None, Reason.BASE_POLICY_FAILED
         # It gets an observation of its own: what it does to it must not change what is judged.
         own = {key: value.clone() if isinstance(value, Tensor) else value for key, value in batch.items()}
+        left_s = self.shield.time_left(age_s, self._rows(batch))
         try:
-            if self.shield.clock is standing_still:
-                return self.base.propose(own), Reason.BASE_POLICY_FAILED
-            left_s = self.shield.time_left(age_s, _rows(batch))
             return self._in_time(lambda: self.base.propose(own), left_s), Reason.BASE_POLICY_FAILED
         except TimeoutError as e:
             self.shield.note_failure("the base policy was late", e)
             return None, Reason.DEADLINE_MISSED
-        except (Exception, SystemExit) as e:
+        except Exception as e:
             if self.config.law.mode == "monitor":  # there is nothing else to do than what the policy wants
                 raise
             self.shield.note_failure("the base policy failed", e)
             return None, Reason.BASE_POLICY_FAILED
 
-    def _replan(self, executed: Tensor | None) -> None:
-        """Have the base policy plan anew after an override (B, A), or begin; one that cannot is asked nothing."""
+    def _rows(self, batch: dict[str, Tensor]) -> int:
+        """For how many robots an observation is, by what the filter reads of it."""
+        read = [batch.get(key) for key in self.model.inputs]
+        return min((len(value) for value in read if isinstance(value, Tensor) and value.dim() > 1), default=1)
+
+    def _replan(self, executed: Tensor | None, seconds: float | None) -> None:
+        """Have the base policy plan anew after an override (B, A), or begin; one that cannot is asked nothing.
+
+        Args:
+            seconds: to wait for it at most; None: however long it takes.
+        """
         if self._in_time.busy:  # it is still at work on what is past
             self._base_lost = True
             return
         try:
-            self.base.reset() if executed is None else self.base.replan(executed)
+            self._in_time(lambda: self.base.reset() if executed is None else self.base.replan(executed), seconds)
             self._base_lost = False
-        except (Exception, SystemExit) as e:
+        except Exception as e:
             self._base_lost = True
             self.shield.note_failure("the base policy could not plan anew", e)
 
@@ -297,11 +304,6 @@ class LatentSafePolicy(PreTrainedPolicy):
                             tags: list[str] | None, cfg=None, dataset_meta=None) -> ModelCard:  # fmt: skip
         """A card that says what the filter was trained on, how epsilon was set, and what it is not."""
         return make_model_card(self.config, dataset_repo_id, license, tags)
-
-
-def _rows(batch: dict[str, Tensor]) -> int:
-    """For how many robots an observation is."""
-    return max((len(v) for v in batch.values() if isinstance(v, Tensor) and v.dim() > 1), default=1)
 
 
 def _check(folder: Path, config: PreTrainedConfig, training: bool) -> None:

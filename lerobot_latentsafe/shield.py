@@ -5,6 +5,7 @@ in range and familiar ever counts as safe; and whatever fails, there is a decisi
 """
 
 import logging
+import math
 import threading
 import time
 import weakref
@@ -28,6 +29,7 @@ from lerobot_latentsafe.decision import (
 from lerobot_latentsafe.guard import UNSEEN, Guard, Pace, Seen
 from lerobot_latentsafe.latent import Belief, Latent, is_sound, map_latent, replace_rows
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
+from lerobot_latentsafe.runtime.time_limit import TimeLimit
 from lerobot_latentsafe.safety_model import SafetyModel
 
 logger = logging.getLogger(__name__)
@@ -57,7 +59,8 @@ class Shield:
 
     Args:
         model: a trained safety model, and by its configuration the law.
-        clock: seconds, monotonic; `standing_still` where a simulation waits for the decision.
+        clock: seconds, monotonic. Any but the machine's is a simulation's, which waits for whoever decides;
+            `standing_still` is one to which nothing is late.
 
     Attributes:
         guard: checks what is seen and told.
@@ -73,6 +76,7 @@ class Shield:
         self.pace = Pace(model.config.trained_on.fps)
         self.failures: Counter[str] = Counter()
         self.took_s, self._warm = 0.0, False
+        self._in_time = TimeLimit(model.device.type)
         self._lock = threading.RLock()
         self._same_weights: weakref.WeakKeyDictionary[Shield, bool] = weakref.WeakKeyDictionary()
         keep_freed_memory()
@@ -115,7 +119,9 @@ class Shield:
                 torch.zeros(1, dtype=torch.long, device=units.device),
             )
             self.overrides = Overrides(1, units.device)
-            self._judge(Seen(images, self.guard.pose, fault), fault, self._hear(hold), hold)
+            # In the thread that decides later on, as what is made at first use is made for each thread.
+            seconds = None if self.patience() is None else math.inf
+            self._judge(Seen(images, self.guard.pose, fault), fault, self._hear(hold), hold, seconds)
             self._warm = True
             self._forget()
 
@@ -164,7 +170,7 @@ class Shield:
             self.overrides = self.overrides or Overrides(len(hold), hold.device)
             # What is wrong is not judged: in its place stands what would be done instead, to stay.
             judged = self._hear(torch.where((faults != Reason.PASSED)[:, None], hold, clipped))
-            judgement, faults = self._judge(seen, faults, judged, hold)
+            judgement, faults = self._judge(seen, faults, judged, hold, self.patience(len(hold)))
             self.took_s = self.clock() - started
             faults = self._late(faults, age_s + self.took_s, Reason.DEADLINE_MISSED, len(hold), self.took_s)
             decision = self._decide(judgement, seen, faults, hold, proposed, clipped)
@@ -178,9 +184,14 @@ class Shield:
         if disarmed is not None:
             self.guard.say_once("THIS FILTER DOES NOT ACT BY WHAT IT SEES", disarmed)
 
-    def time_left(self, age_s: float, n: int = 1) -> float:
-        """Seconds that a base policy may take for n robots, so that the decision after it is still in time."""
-        return self.pace.oldest(self.model.config.law.slack_ms, n) - age_s - self.took_s
+    def patience(self, n: int = 1) -> float | None:
+        """Seconds that a tick for n robots waits for whoever may hang: a period each; None where a simulation waits."""
+        return self.pace.oldest(self.model.config.law.slack_ms, n) if self.clock is time.perf_counter else None
+
+    def time_left(self, age_s: float, n: int = 1) -> float | None:
+        """Seconds that a base policy may take, so that the decision after it is still in time; None: any."""
+        patience = self.patience(n)
+        return None if patience is None else patience - age_s - self.took_s
 
     def _late(self, faults: Tensor, age_s: float, reason: Reason, n: int = 1, took_s: float = 0.0) -> Tensor:
         """Mark all as late where an observation is too old, or a decision took too long; a time that is no number is.
@@ -193,20 +204,34 @@ class Shield:
         in_time &= took_s >= 0 and (law.deadline_ms is None or took_s * 1e3 <= law.deadline_ms)
         return faults if in_time else first_fault(faults, everyone, reason)
 
-    def _judge(self, seen: Seen, faults: Tensor, judged: Tensor, hold: Tensor) -> tuple[Judgement, Tensor]:
-        """What the world model says of actions as it hears them (B, A), and the faults with its own."""
+    def _judge(
+        self, seen: Seen, faults: Tensor, judged: Tensor, hold: Tensor, seconds: float | None
+    ) -> tuple[Judgement, Tensor]:
+        """What the world model says of actions as it hears them (B, A), and the faults with its own.
+
+        A world model that has not answered after so many seconds, or that failed, has missed a frame. So it remembers
+        nothing, and the next tick begins with what it sees.
+        """
         nothing = torch.full((len(hold),), torch.nan, device=hold.device)
-        staying = Judgement(self.belief, nothing, nothing, hold, torch.zeros_like(nothing, dtype=torch.bool))
+        unknown = Judgement(Belief(), nothing, nothing, hold, torch.zeros_like(nothing, dtype=torch.bool))
         if self.model.config.law.name == "guard":
-            return staying, faults
+            return unknown, faults
         try:
-            percepts = self.model.world_model.perceive(seen.images)
-            faults = first_fault(faults, ~is_sound(percepts), Reason.FILTER_FAILED)
-            belief = self._filter_history(percepts, seen.state, judged, faults)
-            return Judgement(belief, *self._look_ahead(belief.latent, judged, hold)), faults
+            return self._in_time(lambda: self._imagine(seen, faults, judged, hold), seconds)
+        except TimeoutError as e:
+            self.note_failure("the filter was late", e)
+            reason = Reason.DEADLINE_MISSED
         except Exception as e:
             self.note_failure("the filter failed", e)
-            return staying, first_fault(faults, torch.ones_like(faults, dtype=torch.bool), Reason.FILTER_FAILED)
+            reason = Reason.FILTER_FAILED
+        return unknown, first_fault(faults, torch.ones_like(faults, dtype=torch.bool), reason)
+
+    def _imagine(self, seen: Seen, faults: Tensor, judged: Tensor, hold: Tensor) -> tuple[Judgement, Tensor]:
+        """Take in what is seen, and look ahead; changes nothing here, as it may be late."""
+        percepts = self.model.world_model.perceive(seen.images)
+        faults = first_fault(faults, ~is_sound(percepts), Reason.FILTER_FAILED)
+        belief = self._filter_history(percepts, seen.state, judged, faults)
+        return Judgement(belief, *self._look_ahead(belief.latent, judged, hold)), faults
 
     def _look_ahead(self, latent: Latent, judged: Tensor, hold: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """V of an action and l now (B,); the fallback (B, A); whether an override would be the retreat's (B,)."""
@@ -238,9 +263,10 @@ class Shield:
 
     def _remember(self, judgement: Judgement, decision: FilterDecision, observation: dict[str, Any]) -> None:
         self.overrides = self.overrides.after(decision.intervened, judgement.retreats)
-        self.belief, self.decision = judgement.belief, decision
+        self.belief = judgement.belief
+        self.decision = replace(decision, action=decision.action.clone())  # what is returned is the caller's to change
         self.observed = {key: observation[key] for key in self.model.inputs if key in observation}
-        self.was_executed(decision.action)
+        self.was_executed(self.decision.action)
         self._tell(decision)
 
     @property

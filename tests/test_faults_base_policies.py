@@ -2,6 +2,7 @@
 
 import math
 import threading
+from asyncio import CancelledError
 from collections import deque
 from types import SimpleNamespace
 
@@ -103,6 +104,8 @@ GIVES = [
 ]  # fmt: skip
 RAISES = [
     stays("B08", "it raises, SystemExit too", raises(SystemExit(0)), FAILED),
+    stays("B08", "it raises, SystemExit too", raises(GeneratorExit()), FAILED),
+    stays("B08", "it raises, SystemExit too", raises(CancelledError()), FAILED),
     stays("B08", "it raises, SystemExit too", raises(RuntimeError("CUDA out of memory")), FAILED),
     stays("B08", "it raises, SystemExit too", raises(KeyError("observation.environment_state")), FAILED),
     stays("B08", "it raises, SystemExit too", raises(StopIteration()), FAILED),
@@ -134,16 +137,71 @@ def test_what_it_raises_does_not_get_out(shielded, act, reason, caplog):
         assert decision.reason.eq(reason).all()
         shielded.assert_stays(decision)
     failures = shielded.shield.failures
-    assert failures["the base policy failed"] == 2 and caplog.text.count("Traceback") == 1
+    assert failures["the base policy failed"] == 2 and sum(bool(record.exc_info) for record in caplog.records) == 1
     policy.act = lambda batch: shielded.wanted.clone()
     assert decide(shielded, 3).reason.eq(Reason.PASSED).all()
 
 
 @faulty.fault("B08", "somebody presses Ctrl-C", "The program ends, as it should")
-def test_an_interrupt_is_not_held_back(shielded):
-    stand_in(shielded).act = raises(KeyboardInterrupt())
+@pytest.mark.parametrize("method", ["select_action", "was_overridden"])
+def test_an_interrupt_is_not_held_back(shielded, method):
+    setattr(stand_in(shielded), method, raises(KeyboardInterrupt()))
+    shielded.policy.config.law.epsilon = faulty.PASSES_NOTHING
     with pytest.raises(KeyboardInterrupt):
         decide(shielded, 0)
+
+
+PLANS = {
+    "nothing": lambda x: None,
+    "words": lambda x: "left",
+    "single actions": lambda x: x[0],
+    "actions of more numbers": lambda x: torch.cat([x, x], 1),
+    "actions of more robots": lambda x: torch.cat([x, x]),
+    "complex numbers": lambda x: x.to(torch.complex64),
+}
+
+
+@faulty.fault("B04", "what it plans is no chunk of actions", "Each action is judged when it is due, and that is said")
+@pytest.mark.parametrize("plan", PLANS)
+def test_plans_that_are_no_actions_hold_nothing_up(shielded, plan, caplog):
+    decide(shielded, 0)
+    policy = stand_in(shielded)
+
+    def act(batch):
+        policy._queues["action"].extend([PLANS[plan](shielded.wanted)] * 3)
+        return shielded.wanted.clone()
+
+    policy.act = act
+    for t in (1, 2):
+        assert decide(shielded, t).reason.eq(Reason.PASSED).all()
+    assert caplog.text.count("cannot be read") == 1
+
+
+class Raising(torch.Tensor):
+    """A tensor with which nothing can be done."""
+
+    @classmethod
+    def __torch_function__(cls, *_, **__):
+        raise RuntimeError("no")
+
+
+@faulty.fault("B06", "its action is a tensor with which nothing can be done", "The robot stays: `BASE_POLICY_FAILED`")
+def test_an_action_with_which_nothing_can_be_done_is_none(shielded):
+    decide(shielded, 0)
+    stand_in(shielded).act = lambda batch: shielded.wanted.clone().as_subclass(Raising)
+    decision = decide(shielded, 1)
+    assert decision.reason.eq(FAILED).all()
+    shielded.assert_stays(decision)
+
+
+@faulty.fault("B18", "it changes what it proposed afterwards", "What was judged counts")
+def test_what_it_does_to_its_action_afterwards_changes_nothing(shielded):
+    action = shielded.wanted.clone()
+    stand_in(shielded).act = lambda batch: action
+    decision = decide(shielded, 0)
+    action.fill_(math.nan)
+    torch.testing.assert_close(decision.proposed, shielded.wanted)
+    torch.testing.assert_close(decision.action, shielded.wanted)
 
 
 # -- planning anew ---
@@ -151,7 +209,7 @@ def test_an_interrupt_is_not_held_back(shielded):
 REPLANNED = "The robot gets the fallback's action; the policy is asked nothing until it could plan anew"
 REPLANS = [
     row("B17", "it fails while it plans anew after an override", error, outcome=REPLANNED)
-    for error in (RuntimeError("no plan"), SystemExit(1), AttributeError("no queue"))
+    for error in (RuntimeError("no plan"), SystemExit(1), GeneratorExit(), AttributeError("no queue"))
 ]
 
 
@@ -169,6 +227,26 @@ def test_a_failure_while_planning_anew_keeps_no_decision_back(shielded, error):
     torch.testing.assert_close(decision.action, shielded.shield.guard.stay)
     del policy.was_overridden, policy.reset
     assert decide(shielded, 3).reason.eq(Reason.PASSED).all() and asked
+
+
+@faulty.fault(
+    "B17",
+    "it hangs while it plans anew after an override",
+    "The robot gets the fallback's action within a period; the policy is asked again when it is back",
+)
+def test_a_policy_that_hangs_while_it_plans_anew_holds_nothing_up(shielded):
+    decide(shielded, 0)
+    policy, shield, over = stand_in(shielded), shielded.shield, threading.Event()
+    policy.was_overridden = lambda executed: over.wait(60.0)
+    shield.patience = lambda n=1: 0.02 if shield.decision.intervened.any() else 60.0
+    shielded.policy.config.law.epsilon = faulty.PASSES_NOTHING
+    assert decide(shielded, 1).intervened.all()
+    del shield.patience
+    shielded.policy.config.law.epsilon = faulty.PASSES_ALL
+    assert decide(shielded, 2).reason.eq(FAILED).all()
+    over.set()
+    shielded.policy._in_time._last.result(60.0)
+    assert decide(shielded, 3).reason.eq(Reason.PASSED).all()
 
 
 # -- what it does to the observation ---

@@ -1,6 +1,7 @@
 """Filters that fail, are late or are set so that they protect nothing: nothing passes for that, and robots stay."""
 
 import math
+import threading
 
 import faulty
 import pytest
@@ -8,9 +9,19 @@ import torch
 from faulty import IMAGE, STATE, row, stays
 
 from lerobot_latentsafe.decision import LawConfig, Reason
-from lerobot_latentsafe.evaluation.faults import BROKEN, shown, wild
+from lerobot_latentsafe.evaluation.faults import BROKEN, replaced, shown, wild
 
 # -- what decides ---
+
+
+def ends(error):
+    """A fault of the world model that would end the program."""
+
+    def end(*_):
+        raise error
+
+    return lambda shield: replaced(shield.model.world_model, "step", end)
+
 
 LATE, NO_NUMBER, FAILED = Reason.DEADLINE_MISSED, Reason.VALUE_NOT_FINITE, Reason.FILTER_FAILED
 DECIDING = [
@@ -23,6 +34,8 @@ DECIDING = [
     stays("S42", "the margin is infinite, or 1e30", BROKEN["a margin of 1e30"], NO_NUMBER),
     stays("S49", "the world model raises", BROKEN["a world model that raises"], FAILED),
     stays("S49", "the world model raises", BROKEN["a world model that cannot correct"], FAILED),
+    stays("S49", "the world model wants to end the program", ends(SystemExit(0)), FAILED),
+    stays("S49", "the world model wants to end the program", ends(GeneratorExit()), FAILED),
     stays("S49", "the margin or the critic raises", BROKEN["a margin that raises"], FAILED),
     stays("S49", "the margin or the critic raises", BROKEN["a critic that raises"], FAILED),
     stays("S50", "the encoder raises", BROKEN["an encoder that raises"], FAILED),
@@ -75,6 +88,21 @@ def test_one_bad_tick_does_not_poison_an_episode(bench, spoil):
     assert after.reason.eq(Reason.PASSED).all() and after.value.isfinite().all()
 
 
+@faulty.fault(
+    "R43b",
+    "what was decided is changed in place before it is used",
+    "It is judged again, and what the robot was told is what was decided",
+)
+def test_what_was_decided_is_not_what_its_user_makes_of_it(bench):
+    seen = bench.begin(1).see(1)
+    decision = bench.shield(seen, bench.wanted.clone())
+    assert bench.shield._decided(seen, decision.action)
+    told = bench.shield.guard.told.clone()
+    decision.action.add_(1.0)
+    torch.testing.assert_close(bench.shield.guard.told, told)
+    assert not bench.shield._decided(seen, decision.action)
+
+
 # -- time ---
 
 
@@ -91,6 +119,37 @@ def test_a_late_decision_does_not_pass_though_no_deadline_is_set(bench, took):
     assert bench.policy.config.law.deadline_ms is None
     decision = bench.decide(0)
     assert decision.reason.eq(Reason.DEADLINE_MISSED).all()
+
+
+@faulty.fault(
+    "B13",
+    "the world model itself hangs",
+    "The robot stays within a period: `DEADLINE_MISSED`; once it is back, the filter goes on with what it sees",
+)
+@pytest.mark.parametrize("part", ["perceive", "step", "correct", "features"])
+def test_a_world_model_that_hangs_holds_nothing_up(bench, part):
+    bench.begin(2)
+    shield, over = bench.shield, threading.Event()
+    work = getattr(shield.model.world_model, part)
+    with replaced(shield.model.world_model, part, lambda *given: over.wait(60.0) and work(*given)):
+        shield.patience = lambda n=1: 0.02
+        for t in (2, 3, 4):
+            decision = bench.decide(t)
+            assert decision.reason.eq(LATE).all()
+            bench.assert_stays(decision)
+        over.set()
+        shield._in_time._last.result(60.0)
+    del shield.patience
+    after = bench.decide(5)
+    assert after.reason.eq(Reason.PASSED).all() and after.value.isfinite().all() and shield.belief.n_frames == 1
+
+
+def test_in_time_or_in_a_simulation_a_filter_decides_alike(bench):
+    bench.begin()
+    waiting = [bench.decide(t).value for t in range(3)]
+    bench.begin().shield.patience = lambda n=1: 60.0
+    for t, value in enumerate(waiting):
+        torch.testing.assert_close(bench.decide(t).value, value, rtol=0, atol=0)
 
 
 @faulty.fault(
@@ -121,23 +180,26 @@ def test_after_a_pause_nothing_of_before_is_remembered(bench, gap):
 SHOUTED = "Warned of at every start: `THIS FILTER DOES NOT ACT BY WHAT IT SEES`"
 NEVER, ALWAYS = "V is never that low: no value makes it act", "it always acts"
 DISARMED = [
-    row("S60", "epsilon is NaN", math.nan, None, outcome="Refused (`ValueError`), with what was expected"),
-    row("S60", "epsilon is -2 or -infinity", -2.0, NEVER, outcome=SHOUTED),
-    row("S60", "epsilon is -2 or -infinity", -math.inf, NEVER, outcome=SHOUTED),
-    row("C16", "config.json says that epsilon is -1e9", -1e9, NEVER, outcome=SHOUTED),
-    row("S60", "epsilon is 2 or infinity", 2.0, ALWAYS, outcome=SHOUTED),
-    row("S60", "epsilon is 2 or infinity", math.inf, ALWAYS, outcome=SHOUTED),
+    row("S60", "epsilon is NaN", "epsilon", math.nan, None, outcome="Refused (`ValueError`), with what was expected"),
+    row("S60", "epsilon is -2 or -infinity", "epsilon", -2.0, NEVER, outcome=SHOUTED),
+    row("S60", "epsilon is -2 or -infinity", "epsilon", -math.inf, NEVER, outcome=SHOUTED),
+    row("C16", "config.json says that epsilon is -1e9", "epsilon", -1e9, NEVER, outcome=SHOUTED),
+    row("S60", "epsilon is 2 or infinity", "epsilon", 2.0, ALWAYS, outcome=SHOUTED),
+    row("S60", "epsilon is 2 or infinity", "epsilon", math.inf, ALWAYS, outcome=SHOUTED),
+    row("S60", "slack_ms is a second or more", "slack_ms", 1e3, "counts as fresh", outcome=SHOUTED),
+    row("S60", "slack_ms is a second or more", "slack_ms", 1e300, "counts as fresh", outcome=SHOUTED),
 ]
 
 
-@pytest.mark.parametrize(("epsilon", "warning"), DISARMED)
-def test_a_threshold_that_disarms_is_refused_or_shouted(benches, epsilon, warning, caplog):
+@pytest.mark.parametrize(("name", "value", "warning"), DISARMED)
+def test_a_setting_that_disarms_is_refused_or_shouted(benches, monkeypatch, name, value, warning, caplog):
     if warning is None:
         with pytest.raises(ValueError, match=r"law.epsilon is nan; expected a number"):
-            LawConfig(epsilon=epsilon)
+            LawConfig(**{name: value})
         return
     policy = benches["car"].begin().policy
-    policy.config.law.epsilon = epsilon
+    monkeypatch.setattr(policy.config.law, "epsilon", 0.0)
+    monkeypatch.setattr(policy.config.law, name, value)
     policy.decide(benches["car"].see(0))
     assert "THIS FILTER DOES NOT ACT BY WHAT IT SEES" in caplog.text and warning in caplog.text
 

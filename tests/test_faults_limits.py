@@ -20,7 +20,7 @@ LIMITED = [
         LIMITS,
         "Names of a base policy's numbers are known",
     ),
-    ("B13", "the world model itself hangs", LIMITS, "A decision that has begun is not interrupted."),
+    ("B13", "a GPU hangs, on which the filter runs", LIMITS, "A GPU that hangs holds the robot's loop up."),
 ]
 
 

@@ -7,6 +7,7 @@ import torch
 from hub_stub import Hub
 from huggingface_hub import ModelCard, constants
 
+from lerobot_latentsafe.decision import LawOptions
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.runtime.checkpoint import CheckpointError
 from lerobot_latentsafe.runtime.hub import HubUnreachableError, push_policy, save_policy
@@ -159,6 +160,18 @@ def test_card_says_what_acts_in_place_of_an_unsafe_action(policy):
     assert said() == "the retreat (turn_rate.vel -0.5 a step) for at least 15 steps"
     policy.config.law.retreat_after = 2
     assert said().startswith("the critic's action; after 2 overrides within 10 steps the retreat (turn_rate.vel")
+
+
+def test_card_of_a_guard_says_that_there_is_no_value(policy):
+    config = policy.config
+    config.calibration = {"missed": 0.05, "false_alarms": 0.1, "lead_steps": 3.0, "failing_episodes": 40.0,
+                          "safe_frames": 900.0}  # fmt: skip
+    config.change(law=config.law.changed(LawOptions(name="guard")))
+    text = policy.generate_model_card("me/car", "latentsafe", None, None).text
+    assert "**there is no safety value V**" in text and "| law | guard: checks alone, there is no V |" in text
+    assert "turn_rate.vel in [-1.25, 1.25]" in text and "monitor" in text and "not a certified" in text
+    for told in ("epsilon", "V means", "V read", "critic", "Imagination", "world model |", "learned", "held-out"):
+        assert told not in text
 
 
 def test_unknown_id_is_a_clear_error(hub):

@@ -1,7 +1,9 @@
 """In time: when decisions come, how old what they are made on is, and who is waited for, and how long."""
 
 import math
+import os
 import threading
+from asyncio import CancelledError
 
 import pytest
 import tiny
@@ -92,7 +94,7 @@ def hanging(policy, tiny_diffusion):
     hanging = Hanging(base.policy)
     policy.attach(base)
     policy.reset()
-    policy.shield.clock = lambda: 0.0  # decisions take no time, so only the base policy is late
+    policy.shield.time_left = lambda age_s, n: PERIOD
     policy.config.law.epsilon = -2.0
     yield policy, hanging
     hanging.go.set()
@@ -110,7 +112,7 @@ def test_a_base_policy_that_hangs_is_waited_for_a_period_and_asked_again_when_it
     assert base.asked == 1 and policy.shield.failures["the base policy was late"] == 3
     base.go.set()
     policy._in_time._last.result()
-    policy.config.law.slack_ms = 60_000  # however busy the machine is
+    policy.shield.time_left = lambda age_s, n: 60.0  # however busy the machine is
     assert policy.decide(seen()).reason.item() == Reason.PASSED and base.asked == 2
 
 
@@ -121,8 +123,18 @@ def test_an_episode_may_begin_while_the_base_policy_still_hangs(hanging):
     assert policy.decide(seen()).reason.item() == Reason.BASE_POLICY_FAILED
     base.go.set()
     policy._in_time._last.result()
-    policy.config.law.slack_ms = 60_000
+    policy.shield.time_left = lambda age_s, n: 60.0
     assert policy.decide(seen()).reason.item() == Reason.PASSED
+
+
+@pytest.mark.parametrize("more", [{}, {"observation.language": torch.zeros(1000, 4)}, {"index": torch.zeros(9)}])
+def test_a_period_is_for_each_robot_that_the_filter_sees(policy, tiny_diffusion, more):
+    policy.attach(tiny_diffusion)
+    policy.reset()
+    asked = []
+    policy.shield.time_left = lambda age_s, n: asked.append(n)
+    policy.decide({**seen(), **more})
+    assert asked == [1]
 
 
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode, torch.enable_grad])
@@ -138,10 +150,46 @@ def test_work_with_a_limit_finds_torch_as_whoever_asks(mode):
                 assert limit(torch.get_num_threads, 60.0) == torch.get_num_threads()
 
 
-@pytest.mark.parametrize("error", [ValueError, SystemExit, KeyboardInterrupt])
-def test_work_with_a_limit_raises_what_the_work_did(error):
+@pytest.mark.parametrize("seconds", [60.0, math.inf, None])
+@pytest.mark.parametrize(
+    ("error", "raised"),
+    [(ValueError, ValueError), (KeyboardInterrupt, KeyboardInterrupt), (TimeoutError, TimeoutError),
+     (SystemExit, RuntimeError), (GeneratorExit, RuntimeError), (CancelledError, RuntimeError)],
+)  # fmt: skip
+def test_work_with_a_limit_ends_no_program_and_holds_no_interrupt_back(error, raised, seconds):
     def fail():
         raise error("no")
 
-    with pytest.raises(error):
-        TimeLimit()(fail, 60.0)
+    with pytest.raises(raised):
+        TimeLimit()(fail, seconds)
+
+
+@pytest.mark.parametrize("seconds", [math.nan, -1.0, 0.0, -math.inf])
+def test_of_a_time_that_is_none_nothing_is_waited_for(seconds):
+    limit, over = TimeLimit(), threading.Event()
+    with pytest.raises(TimeoutError):
+        limit(over.wait, seconds)
+    for further in (60.0, None):
+        with pytest.raises(TimeoutError, match="not ended yet"):
+            limit(over.wait, further)
+    over.set()
+
+
+def test_a_thread_ends_with_whoever_it_works_for():
+    limit = TimeLimit()
+    thread = limit(threading.current_thread, 60.0)
+    del limit
+    thread.join(60.0)
+    assert not thread.is_alive()
+
+
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_in_a_forked_process_work_is_done_by_a_thread_of_its_own():
+    limit, over = TimeLimit(), threading.Event()
+    with pytest.raises(TimeoutError):
+        limit(over.wait, 0.0)
+    child = os.fork()
+    if not child:
+        os._exit(0 if limit(lambda: 3, 60.0) == 3 else 1)
+    over.set()
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0

@@ -92,6 +92,23 @@ def test_entries_that_mean_nothing_are_refused(filter_copy, kind):
         load_filter(filter_copy)
 
 
+REASONS = {
+    "device": ({"device": "meta"}, "Unknown device meta"),
+    "retreat": ({"law": {"retreat": {"lift": 1.0}}}, r"retreat moves lift; the actions are turn_rate\.vel"),
+    "lookahead": ({"law": {"lookahead": 99}}, r"lookahead is 99; expected 0 \(critic alone\) to 25"),
+    "margin": ({"margin": {"delta": -1.0}}, r"margin\.delta is -1\.0; expected a positive number"),
+    "base_ahead": ({"base_ahead": -1}, r"base_ahead is -1; expected 0"),
+}
+
+
+@pytest.mark.parametrize("name", REASONS)
+def test_an_entry_that_is_refused_says_what_was_expected(filter_copy, name):
+    change, reason = REASONS[name]
+    tiny.rewrite_json(filter_copy / "config.json", **change)
+    with pytest.raises(CheckpointError, match=rf"config\.json is not readable \(.*{reason}"):
+        read_config(filter_copy)
+
+
 def header(length, content=b""):
     return struct.pack("<Q", length) + content
 
@@ -139,6 +156,9 @@ EDITS = {
     "activation": lambda c: c["reachability"].update(activation="tanh"),
     "sizes": lambda c: c["reachability"].update(components=8),
     "proportions": lambda c: c["input_features"]["observation.image"].update(shape=[3, 96, 128]),
+    "action": lambda c: c["output_features"]["action"].update(type="STATE"),
+    "another output": lambda c: c["output_features"].update({"action.left": {"type": "ACTION", "shape": [2]}}),
+    "no output": lambda c: c.update(output_features={}),
     "specification": lambda c: c["margin"].update(failure_specification="other"),
     "normalisation": lambda c: c["normalization_mapping"].update(VISUAL="MEAN_STD"),
     "range": lambda c: c["trained_on"].update(action_high=[9.0, 9.0]),
@@ -149,6 +169,7 @@ EDITS = {
 @pytest.mark.parametrize("what", EDITS)
 @pytest.mark.fault("C13", "the critic's activation is edited in config.json", "Refused (`CheckpointError`)")
 @pytest.mark.fault("C14", "the camera's proportions are edited in config.json", "Refused (`CheckpointError`)")
+@pytest.mark.fault("C14", "what an action is is edited in config.json", "Refused (`CheckpointError`)")
 def test_what_decides_is_sealed(filter_copy, what):
     edit(filter_copy / "config.json", EDITS[what])
     with pytest.raises(CheckpointError, match=r"config\.json was edited"):
@@ -211,10 +232,18 @@ def test_processors_that_are_not_sealed_change_nothing(filter_copy, kind):
         load_filter(filter_copy)
 
 
-def test_an_older_seal_is_believed_for_what_it_covers(filter_copy):
+OLDER = {
+    "before 0.3": SEALED,
+    "without output_features": [name for name in SEALED_ENTRIES if name != "output_features"],
+}
+
+
+@pytest.mark.parametrize("version", OLDER)
+def test_an_older_seal_is_believed_for_what_it_covers(filter_copy, version):
     unrecorded(filter_copy, lambda steps: None)
+    entries = list(OLDER[version])
     edit(filter_copy / "integrity.json", lambda record: record.update(
-        entries=list(SEALED), config_sha256=checkpoint._config_digest(filter_copy, SEALED)))  # fmt: skip
+        entries=entries, config_sha256=checkpoint._config_digest(filter_copy, entries)))  # fmt: skip
     policy = load_filter(filter_copy)
     save_policy(policy, filter_copy.parent / "again")
     assert json.loads((filter_copy.parent / "again" / "integrity.json").read_text())["entries"] == list(SEALED_ENTRIES)

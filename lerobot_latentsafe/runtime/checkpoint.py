@@ -160,10 +160,11 @@ def read_config(folder: Path, device: str | None = None) -> PreTrainedConfig:
     try:
         config = PreTrainedConfig.from_pretrained(folder)
     except Exception as e:  # draccus meets with entries of any type, and each setting has checks of its own
-        old = next((cause for cause in (e, e.__cause__) if isinstance(cause, OldLayoutError)), None)
-        if old is not None:
-            raise CheckpointError(f"{folder}: {old}") from e
-        reason = e.__cause__ if isinstance(e, draccus.utils.DecodingError) and e.__cause__ else e
+        reason: BaseException = e
+        while isinstance(reason, draccus.utils.ParsingError) and reason.__cause__:  # where; its cause says what
+            reason = reason.__cause__
+        if isinstance(reason, OldLayoutError):
+            raise CheckpointError(f"{folder}: {reason}") from e
         raise CheckpointError(f"{folder / CONFIG} is not readable ({reason}); correct that entry, or {AGAIN}") from e
     if device is not None:
         config.device = device

@@ -2,6 +2,7 @@
 
 import queue
 import threading
+import weakref
 from collections.abc import Callable
 from concurrent.futures import Future, wait
 from typing import Any
@@ -10,11 +11,21 @@ import torch
 
 
 class Worker:
-    """A thread that does one thing after the other, and that never keeps a program from ending as a pool's would."""
+    """A thread that does one thing after the other, and that never keeps a program from ending as a pool's would.
+
+    It ends when nobody has the worker any more.
+    """
 
     def __init__(self, name: str):
         self._asked: queue.SimpleQueue = queue.SimpleQueue()
-        threading.Thread(target=_serve, args=(self._asked,), daemon=True, name=name).start()
+        self._thread = threading.Thread(target=_serve, args=(self._asked,), daemon=True, name=name)
+        self._thread.start()
+        weakref.finalize(self, self._asked.put, None)
+
+    @property
+    def alive(self) -> bool:
+        """Whether the thread is there: in a forked process it is not."""
+        return self._thread.is_alive()
 
     def submit(self, work: Callable[..., Any], *given: Any) -> Future:
         """The future result of some work."""
@@ -24,8 +35,14 @@ class Worker:
 
 
 def _serve(asked: queue.SimpleQueue) -> None:
-    while True:
-        _settle(*asked.get())  # nothing is kept alive while there is nothing to do
+    while _settled(asked.get()):  # nothing is kept alive while there is nothing to do
+        pass
+
+
+def _settled(asked: tuple[Future, Callable[..., Any], tuple] | None) -> bool:
+    if asked is not None:
+        _settle(*asked)
+    return asked is not None
 
 
 def _settle(future: Future, work: Callable[..., Any], given: tuple = ()) -> None:
@@ -33,6 +50,24 @@ def _settle(future: Future, work: Callable[..., Any], given: tuple = ()) -> None
         future.set_result(work(*given))
     except BaseException as e:  # SystemExit, too: whoever asked decides
         future.set_exception(e)
+
+
+def contained[Answer](work: Callable[[], Answer], what: str = "it") -> Answer:
+    """What some work returns. What would end the program is an error like any other; only Ctrl-C goes through.
+
+    Args:
+        what: the work's name in errors.
+
+    Raises:
+        RuntimeError: it raised what is no `Exception`, such as SystemExit or GeneratorExit.
+        Exception, KeyboardInterrupt: it raised that.
+    """
+    try:
+        return work()
+    except (Exception, KeyboardInterrupt):
+        raise
+    except BaseException as e:
+        raise RuntimeError(f"{what} raised {type(e).__name__}") from e
 
 
 def in_time[Answer](call: Callable[[], Answer], seconds: float, what: str) -> Answer:
@@ -50,12 +85,10 @@ def in_time[Answer](call: Callable[[], Answer], seconds: float, what: str) -> An
         Exception: whatever else it raised.
     """
     answer: Future[Answer] = Future()
-    threading.Thread(target=_settle, args=(answer, call), daemon=True, name=f"in-time-{what}").start()
+    given = (answer, contained, (call, what))
+    threading.Thread(target=_settle, args=given, daemon=True, name=f"in-time-{what}").start()
     if not wait([answer], seconds).done:
         raise TimeoutError(f"{what} did not end within {seconds:.3g} s")
-    error = answer.exception()
-    if error is not None and not isinstance(error, Exception):
-        raise RuntimeError(f"{what} raised {type(error).__name__}") from error
     return answer.result()
 
 
@@ -78,20 +111,30 @@ class TimeLimit:
     @property
     def busy(self) -> bool:
         """Whether earlier work has not ended yet."""
-        return self._last is not None and not self._last.done()
+        return self._last is not None and not self._last.done() and self._worker is not None and self._worker.alive
 
-    def __call__(self, work: Callable[[], Any], seconds: float) -> Any:
-        """The result of the work.
+    def __call__[Answer](self, work: Callable[[], Answer], seconds: float | None) -> Answer:
+        """The result of the work, `contained`.
+
+        Args:
+            seconds: to wait at most; None: it is done here, however long it takes.
 
         Raises:
             TimeoutError: it took longer, or earlier work has not ended yet.
-            BaseException: what the work raised.
+            RuntimeError: it wanted to end the program.
+            Exception, KeyboardInterrupt: it raised that.
         """
         if self.busy:
             raise TimeoutError("what was asked before has not ended yet")
-        self._worker = self._worker or Worker("time-limit")
-        self._last = self._worker.submit(_as_here(work, self.device_type))
-        return self._last.result(timeout=max(seconds, 0.0))
+        if seconds is None:
+            return contained(work)
+        if self._worker is None or not self._worker.alive:
+            self._worker = Worker("time-limit")
+        self._last = answer = self._worker.submit(contained, _as_here(work, self.device_type))
+        limit = min(seconds, threading.TIMEOUT_MAX) if seconds > 0 else 0.0  # of a time that is no number none is left
+        if not wait([answer], limit).done:
+            raise TimeoutError(f"it did not end within {limit:.3g} s")
+        return answer.result()
 
 
 def _as_here(work: Callable[[], Any], device_type: str) -> Callable[[], Any]:
