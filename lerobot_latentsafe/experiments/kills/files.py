@@ -61,5 +61,5 @@ def _alike(name: str, one: object, other: object) -> bool:
     one, other = repr(one), repr(other)
     if one == other or not name.endswith("meta/stats.json"):
         return one == other
-    numbers = [np.array(re.findall(r"[-\d.e]*\d", text), float) for text in (one, other)]
-    return len(numbers[0]) == len(numbers[1]) and np.allclose(*numbers, rtol=0, atol=1e-6)
+    ours, theirs = (np.array(re.findall(r"[-\d.e]*\d", text), float) for text in (one, other))
+    return len(ours) == len(theirs) and np.allclose(ours, theirs, rtol=0, atol=1e-6)
