@@ -4,7 +4,8 @@
     scripts/kill_verbs.py --n=20
 
 Writes results/reliability/kills.json: for each verb how many kills there were, how many came before the run had ended,
-and how many runs then ended as the undisturbed one, to the last bit.
+and how many runs then ended as the undisturbed one, to the last bit, with nothing lost in between that was said to be
+saved. Rows of verbs that are not measured stay, each with the commit that made it.
 """
 
 import os
@@ -13,13 +14,15 @@ os.environ["OMP_NUM_THREADS"] = "1"
 os.environ["HF_HUB_OFFLINE"] = "1"
 
 import argparse
+import json
 import tempfile
 from pathlib import Path
 
-from lerobot_latentsafe.cli import evaluate, label, record, train  # noqa: F401  (before any fork)
+from lerobot_latentsafe.cli import deploy, evaluate, label, record, train  # noqa: F401  (before any fork)
 from lerobot_latentsafe.cli import main as latentsafe
 from lerobot_latentsafe.evaluation.statistics import provenance, write_json
-from lerobot_latentsafe.experiments.kills import VERBS, kill_verbs
+from lerobot_latentsafe.experiments.kills.measurement import kill_verbs, with_rows
+from lerobot_latentsafe.experiments.kills.verbs import VERBS
 
 
 def main() -> None:
@@ -32,7 +35,8 @@ def main() -> None:
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         rows = kill_verbs(arguments.work or Path(folder), arguments.verbs, arguments.n, arguments.seed, latentsafe)
-    write_json(arguments.output, {"verbs": rows, **provenance(seeds=[arguments.seed])})
+    known = json.loads(arguments.output.read_text()) if arguments.output.exists() else {}
+    write_json(arguments.output, {"verbs": with_rows(known, rows), **provenance(seeds=[arguments.seed])})
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ os.environ["TOKENIZERS_PARALLELISM"] = "false"
 
 import logging
 import shutil
-import threading
 import time
 
 import faulty
@@ -20,6 +19,8 @@ import pytest
 import tiny
 import torch
 from hypothesis import settings
+
+from lerobot_latentsafe.experiments.virtual_time import VirtualTime
 
 torch.set_num_threads(1)
 # The same examples in every run of the suite; scripts/fuzz.py draws others.
@@ -50,25 +51,6 @@ def no_hurry(monkeypatch, request):
     from lerobot_latentsafe.shield import Shield
 
     monkeypatch.setattr(Shield.__init__, "__defaults__", (standing_still,))
-
-
-class VirtualTime:
-    """Time that passes while the test's thread sleeps, at once, and not while it computes: no machine is too slow."""
-
-    def __init__(self):
-        self.now, self.thread, self.wait = 1000.0, threading.get_ident(), time.sleep
-
-    def perf_counter(self) -> float:
-        """Seconds; a look takes a microsecond, so that a loop that waits for a time ends."""
-        self.sleep(1e-6)
-        return self.now
-
-    def sleep(self, seconds: float) -> None:
-        """Let time pass; other threads wait in earnest."""
-        if threading.get_ident() == self.thread:
-            self.now += seconds
-        else:
-            self.wait(seconds)
 
 
 @pytest.fixture

@@ -4,26 +4,17 @@ import huggingface_hub.utils
 import pytest
 import tiny
 import torch
-from hub_stub import Hub
 from huggingface_hub import ModelCard, constants
 
 from lerobot_latentsafe.decision import LawOptions
+from lerobot_latentsafe.experiments.kills.hub_stub import Hub
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.runtime.checkpoint import CheckpointError
 from lerobot_latentsafe.runtime.hub import HubUnreachableError, push_policy, save_policy
 
 
-def point_to(monkeypatch, url, cache):
-    """What HF_ENDPOINT and its fellows set when huggingface_hub is imported."""
-    settings = {
-        "ENDPOINT": url,
-        "HUGGINGFACE_CO_URL_TEMPLATE": url + "/{repo_id}/resolve/{revision}/{filename}",
-        "HF_HUB_OFFLINE": False,
-        "HF_HUB_DISABLE_XET": True,
-        "HF_HUB_DISABLE_TELEMETRY": True,
-        "HF_HUB_CACHE": str(cache),
-    }
-    for name, value in settings.items():
+def point_to(monkeypatch, hub, cache):
+    for name, value in hub.settings(cache).items():
         monkeypatch.setattr(constants, name, value)
     monkeypatch.setenv("HF_TOKEN", "hf_nobody")
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
@@ -33,7 +24,7 @@ def point_to(monkeypatch, url, cache):
 @pytest.fixture
 def hub(monkeypatch, tmp_path):
     with Hub() as hub:
-        point_to(monkeypatch, hub.url, tmp_path / "cache")
+        point_to(monkeypatch, hub, tmp_path / "cache")
         yield hub
 
 
@@ -41,8 +32,8 @@ def hub(monkeypatch, tmp_path):
 def no_hub(monkeypatch, tmp_path):
     """A port on which nobody answers."""
     with Hub() as closed:
-        url = closed.url
-    point_to(monkeypatch, url, tmp_path / "cache")
+        pass
+    point_to(monkeypatch, closed, tmp_path / "cache")
 
 
 def contents(folder):

@@ -514,6 +514,16 @@ def test_who_is_killed_while_files_are_moved_leaves_nothing_that_loads(policy, f
         load_filter(filter_copy)
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="needs fork")
+def test_what_a_killed_save_left_goes_with_the_next(policy, filter_copy):
+    from test_killed_recording import killed
+
+    killed(lambda: policy.save_pretrained(filter_copy), "lerobot_latentsafe.runtime.checkpoint._move_into", 1)
+    policy.save_pretrained(filter_copy)
+    assert [file.name for file in filter_copy.parent.iterdir() if file.name.startswith(".")] == []
+    load_filter(filter_copy)
+
+
 def test_a_policy_is_saved_over_itself(wrapped):
     policy = load_filter(wrapped)
     policy.config.law.epsilon = 0.25

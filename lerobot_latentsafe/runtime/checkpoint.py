@@ -10,7 +10,6 @@ import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import draccus
@@ -18,7 +17,7 @@ from huggingface_hub import constants, snapshot_download
 from lerobot.configs.policies import PreTrainedConfig
 from safetensors import SafetensorError, safe_open
 
-from lerobot_latentsafe.runtime.files import replacing_folder
+from lerobot_latentsafe.runtime.files import locked_folder, replacing_folder, scratch_folder
 
 PRETRAINED = Path(__file__).parents[1] / "pretrained"
 CONFIG, WEIGHTS, INTEGRITY = "config.json", "model.safetensors", "integrity.json"
@@ -351,9 +350,9 @@ def writing_checkpoint(folder: str | Path) -> Iterator[Path]:
                 partial.mkdir()
                 yield partial
             return
-        with TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as partial:
-            yield Path(partial)
-            _move_into(folder, Path(partial))
+        with locked_folder(folder), scratch_folder(folder) as partial:
+            yield partial
+            _move_into(folder, partial)
     except (OSError, SafetensorError) as e:
         raise CheckpointWriteError(
             f"the checkpoint {folder} could not be written ({e}); no part of it was left there. Free some space or "

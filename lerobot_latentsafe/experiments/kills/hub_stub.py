@@ -5,19 +5,31 @@ import hashlib
 import json
 import re
 import threading
+import time
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from urllib.parse import unquote, urlparse
 
 NO_COMMIT = "0" * 40
+PIECE = 2**18
+"""Bytes of an upload that are taken at once."""
 
 
 class Hub:
-    """`repos`: id -> file name -> content; `commits`: id -> hashes. Serves on 127.0.0.1 between `with`.
+    """Serves on 127.0.0.1 between `with`.
 
-    `fault` is what becomes of weights that are uploaded: "500", "cut", or None.
+    Args:
+        pause_s: seconds that each answer and each piece of an upload takes, as over a line.
+
+    Attributes:
+        repos: id -> file name -> content.
+        commits: id -> hashes.
+        fault: what becomes of weights that are uploaded: "500", "cut", or None.
     """
 
-    def __init__(self):
+    def __init__(self, pause_s: float = 0.0):
+        self.pause_s = pause_s
         self.repos: dict[str, dict[str, bytes]] = {}
         self.commits: dict[str, list[str]] = {}
         self.uploads: dict[str, bytes] = {}
@@ -25,15 +37,27 @@ class Hub:
         self.server = ThreadingHTTPServer(("127.0.0.1", 0), type("Handler", (_Handler,), {"hub": self}))
         self.url = f"http://127.0.0.1:{self.server.server_port}"
 
-    def __enter__(self):
+    def __enter__(self) -> "Hub":
         threading.Thread(target=self.server.serve_forever, args=(0.01,), daemon=True).start()
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         self.server.shutdown()
         self.server.server_close()
 
-    def head(self, repo):
+    def settings(self, cache: Path) -> dict[str, object]:
+        """What HF_ENDPOINT and its fellows set in `huggingface_hub.constants`, for this Hub."""
+        return {
+            "ENDPOINT": self.url,
+            "HUGGINGFACE_CO_URL_TEMPLATE": self.url + "/{repo_id}/resolve/{revision}/{filename}",
+            "HF_HUB_OFFLINE": False,
+            "HF_HUB_DISABLE_XET": True,
+            "HF_HUB_DISABLE_TELEMETRY": True,
+            "HF_HUB_CACHE": str(cache),
+        }
+
+    def head(self, repo: str) -> str:
+        """The last commit."""
         return ([NO_COMMIT] + self.commits[repo])[-1]
 
 
@@ -46,6 +70,9 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_any(self):
         path, body = unquote(urlparse(self.path).path), self._body()
+        if body is None:
+            self.close_connection = True
+            return None
         for pattern, answer in ROUTES:
             if found := re.fullmatch(pattern, path):
                 known = found.groupdict()
@@ -57,23 +84,39 @@ class _Handler(BaseHTTPRequestHandler):
     do_GET = do_POST = do_PUT = do_HEAD = do_any
 
     def _body(self):
-        if self.headers.get("Transfer-Encoding") != "chunked":
-            return self.rfile.read(int(self.headers.get("Content-Length") or 0))
-        parts = []
-        while size := int(self.rfile.readline(), 16):
-            parts.append(self.rfile.read(size))
+        """What was sent; None if it broke off."""
+        try:
+            if self.headers.get("Transfer-Encoding") != "chunked":
+                return self._read(int(self.headers.get("Content-Length") or 0))
+            parts = []
+            while size := int(self.rfile.readline(), 16):
+                parts.append(self._read(size))
+                self.rfile.readline()
             self.rfile.readline()
-        self.rfile.readline()
+            return b"".join(parts)
+        except (OSError, EOFError, ValueError):
+            return None
+
+    def _read(self, size):
+        parts = []
+        while size:
+            time.sleep(self.hub.pause_s)
+            parts.append(self.rfile.read(min(size, PIECE)))
+            if not parts[-1]:
+                raise EOFError
+            size -= len(parts[-1])
         return b"".join(parts)
 
     def _send(self, content, status=200, headers=None):
+        time.sleep(self.hub.pause_s)
         raw = content if isinstance(content, bytes) else json.dumps(content).encode()
         self.send_response(status)
         for name, value in {"Content-Length": len(raw), "Content-Type": "application/json", **(headers or {})}.items():
             self.send_header(name, str(value))
-        self.end_headers()
-        if self.command != "HEAD":
-            self.wfile.write(raw)
+        with suppress(ConnectionError):  # who asked may be gone
+            self.end_headers()
+            if self.command != "HEAD":
+                self.wfile.write(raw)
 
     # -- pushing ---
 
