@@ -43,9 +43,11 @@ def episode_values(model: SafetyModel, reader: ClipReader, episodes: np.ndarray)
     rows = []
     for episode in episodes:
         index = np.flatnonzero(reader.labels.episode == episode)
-        clip = reader.cut(index[:1], model.world_model.percept_names, length=len(index))
-        value = model.value(map_latent(model.world_model.encode(clip), lambda t: t[0]))
-        rows.append({"value": value.cpu().numpy(), "failure": reader.labels.failure[index]})
+        # A clip from each of the first frames on, where a world model sees every so many.
+        clip = reader.cut(index[: reader.skip], model.world_model.percept_names, length=-(-len(index) // reader.skip))
+        latent = map_latent(model.world_model.encode(clip), lambda t: t.transpose(0, 1).flatten(0, 1))  # in order again
+        value = model.value(latent)[: len(index)].cpu().numpy()
+        rows.append({"value": value, "failure": reader.labels.failure[index]})
     return rows
 
 

@@ -82,9 +82,9 @@ class LawConfig:
             is -risk, so SQRL's threshold of 0.1 is an epsilon of -0.1.
         resume_above: once the fallback has acted, the base policy acts again only where V is above this, if that is
             more than epsilon. A policy that is stopped at every second step shakes what the fallback holds.
-        proposal_steps: steps for which the proposed action is imagined held before V is read. 1 is the paper's law;
+        proposal_steps: ticks for which the proposed action is imagined held before V is read. 1 is the paper's law;
             more leave time for what the world model gets wrong, which a saturated margin cannot.
-        lookahead: steps of imagination before the critic's value is read, 0 to 25: V and the fallback are the best of
+        lookahead: ticks of imagination before the critic's value is read, 0 to 25: V and the fallback are the best of
             the critic's policy and of holding each action. 0 is the critic alone, and the cheapest.
         samples: next latents drawn from a stochastic world model, of which the worst counts; 0 imagines its mean or
             mode. If any, the critic is trained on drawn latents, too.

@@ -4,12 +4,13 @@ The policy wrapper and every other adapter share this one core. Its rule: nothin
 in range and familiar ever counts as safe; and whatever fails, there is a decision.
 """
 
+import copy
 import logging
 import math
 import threading
 import time
 import weakref
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -65,7 +66,10 @@ class Shield:
     Attributes:
         guard: checks what is seen and told.
         pace: of the decisions.
-        executed: (B, A), what the robots were told last, as the world model hears it.
+        executed: what the robots were told in the last ticks, as the world model hears it: (B, A) each, the latest
+            last, at most as many as a step of the world model takes.
+        beliefs: of the episode, by the frames that the world model has seen: where its step is several ticks, every so
+            many frames, beginning with one, with the next, and so on. The first is the one that sees the next frame.
         observed: what the last decision was made on.
         took_s: seconds that the last decision took.
         failures: what failed -> how often.
@@ -97,8 +101,9 @@ class Shield:
 
     def _forget(self) -> None:
         self.guard.reset()
-        self.belief = Belief()
-        self.executed: Tensor | None = None
+        skip = self.model.config.world_model.frame_skip
+        self.beliefs = deque([Belief()] * skip, maxlen=skip)
+        self.executed: deque[Tensor] = deque(maxlen=skip)
         self.observed: dict[str, Tensor] | None = None
         self.decision: FilterDecision | None = None
         self.overrides: Overrides | None = None
@@ -263,21 +268,26 @@ class Shield:
 
     def _remember(self, judgement: Judgement, decision: FilterDecision, observation: dict[str, Any]) -> None:
         self.overrides = self.overrides.after(decision.intervened, judgement.retreats)
-        self.belief = judgement.belief
+        self.beliefs.append(judgement.belief)  # in place of the one that it grew out of
         self.decision = replace(decision, action=decision.action.clone())  # what is returned is the caller's to change
         self.observed = {key: observation[key] for key in self.model.inputs if key in observation}
-        self.was_executed(self.decision.action)
+        self._was_told(self.decision.action)
         self._tell(decision)
 
     @property
     def latent(self) -> Latent | None:
         """The posterior that the last decision was made on."""
-        return self.belief.latent
+        return self.beliefs[-1].latent
 
     def was_executed(self, action: Tensor) -> None:
-        """Remember (B, A) in robot units as what was done; call it where something else was than was decided."""
+        """Remember (B, A) in robot units as what was done, where something else was than was decided."""
+        if self.executed:
+            self.executed.pop()
+        self._was_told(action)
+
+    def _was_told(self, action: Tensor) -> None:
         self.guard.was_told(action)
-        self.executed = self._hear(action)
+        self.executed.append(self._hear(action))
 
     def _hear(self, action: Tensor) -> Tensor:
         """An action (B, A) in robot units as the world model hears it; what is not known does not move."""
@@ -338,8 +348,8 @@ class Shield:
             with self._lock, other._lock:
                 if not (other._decided(observation, action) and self._accepts(other)):
                     continue
-                for name in ("belief", "executed", "observed", "decision", "overrides"):
-                    setattr(self, name, getattr(other, name))
+                for name in ("beliefs", "executed", "observed", "decision", "overrides"):
+                    setattr(self, name, copy.copy(getattr(other, name)))
                 self.guard.adopt(other.guard)
                 return self.decision
         return None
@@ -368,7 +378,9 @@ class Shield:
         """What the world model makes of the episode; rows whose observation is unusable go on by imagination alone."""
         world_model, units = self.model.world_model, self.model.units
         state, blind = units.normalise_state(state).nan_to_num(0.0), torch.isin(faults, faults.new_tensor(UNSEEN))
-        before = judged if self.executed is None else self.executed
+        # Where so many ticks have not been, the belief is a fresh one, and only what counts as first is read of this.
+        n_unknown = self.beliefs.maxlen - len(self.executed)
+        before = torch.cat([*[self.executed[0] if self.executed else judged] * n_unknown, *self.executed], 1)
         first = units.first_action(before)
 
         def observe(latent: Latent | None) -> Latent:
@@ -379,10 +391,11 @@ class Shield:
             predicted = world_model.step(new, led)
             return replace_rows(world_model.correct(predicted, percepts, state), predicted, where=blind)
 
-        return self.belief.after(observe, self.model.config.law.history_frames)
+        n_frames = self.model.config.world_model.steps(self.model.config.law.history_frames)
+        return self.beliefs[0].after(observe, n_frames)
 
     def _go_on(self, latent: Latent, action: Tensor) -> tuple[Latent, Tensor]:
-        """N x B latents after `proposal_steps` steps of the action (B, A), and the least margin until there (N x B,).
+        """N x B latents after `proposal_steps` ticks of the action (B, A), and the least margin until there (N x B,).
 
         N is 1, or the number of samples that are drawn of each robot's future.
         """
@@ -391,7 +404,7 @@ class Shield:
         action = action.repeat(n, 1)
         latent = map_latent(latent, lambda t: t.repeat(n, *[1] * (t.dim() - 1)))
         least = torch.full_like(action[:, 0], torch.inf)
-        for _ in range(law.proposal_steps):
+        for _ in range(self.model.config.world_model.steps(law.proposal_steps)):
             latent = imagination.step(latent, action)
             least = torch.minimum(least, imagination.margin(latent))
         return latent, least

@@ -184,7 +184,7 @@ def test_a_filter_may_say_when(tiny, tmp_path, monkeypatch):
         # What was done instead is told to the policy, and to the filter, which remembers it.
         operator = franka._policy_operator("closes", 20, style, path)
         np.testing.assert_allclose(np.reshape(operator.policy.executed, (-1, 7)), actions[lowered], atol=1e-6)
-        executed = operator.filter.model.units.denormalise_action(operator.filter.shield.executed)[0]
+        executed = operator.filter.model.units.denormalise_action(operator.filter.shield.executed[-1])[0]
         np.testing.assert_allclose(executed.numpy(), actions[-1], atol=1e-5)
     franka._policy_operator.cache_clear()
 

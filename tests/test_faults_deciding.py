@@ -79,7 +79,7 @@ def test_a_fallback_out_of_range_is_not_executed(bench):
 )
 def test_one_bad_tick_does_not_poison_an_episode(bench, spoil):
     bench.begin(2)
-    belief = bench.shield.belief
+    belief = bench.shield.beliefs[-1]
     for latent in (belief.latent, belief.younger):
         for tensor in (latent or {}).values():
             tensor.fill_(spoil)
@@ -141,7 +141,7 @@ def test_a_world_model_that_hangs_holds_nothing_up(bench, part):
         shield._in_time._last.result(60.0)
     del shield.patience
     after = bench.decide(5)
-    assert after.reason.eq(Reason.PASSED).all() and after.value.isfinite().all() and shield.belief.n_frames == 1
+    assert after.reason.eq(Reason.PASSED).all() and after.value.isfinite().all() and shield.beliefs[-1].n_frames == 1
 
 
 def test_in_time_or_in_a_simulation_a_filter_decides_alike(bench):

@@ -148,8 +148,9 @@ def _every(skip: int, percepts: dict[str, Tensor], state: Tensor, action: Tensor
         percepts, state, action: (B, T, ...), actions those taken after each frame.
     """
     apart = lambda t: t.unflatten(1, (-1, skip)).transpose(1, 2).flatten(0, 1)  # noqa: E731
-    ticks = torch.stack([action.roll(n, 1) for n in range(skip, 0, -1)], 2).flatten(2)  # those since the frame before
-    ticks[:, :skip] = model.units.first_action(action[:, :skip].repeat(1, 1, skip))
+    since = torch.arange(state.shape[1])[:, None] - torch.arange(skip, 0, -1)  # the ticks before each frame
+    ticks = action[:, since.clamp(min=0)].flatten(2)
+    ticks[:, :skip] = model.units.first_action(ticks[:, :skip])
     state = apart(state)
     is_first = torch.zeros(state.shape[:2], dtype=torch.bool, device=state.device)
     is_first[:, 0] = True
