@@ -106,7 +106,7 @@ def imagined_episodes(
     Returns:
         verdicts: balanced accuracy of "fails within `horizon` steps"; shuffled: the same under other episodes' actions;
         still: the same if holding still is imagined whatever was done; false_alarms: of the episodes that do not fail;
-        hold_false_alarms: of holding still, which fails in none.
+        hold_false_alarms: of holding still, which fails in none. None are shares of nothing.
     """
     clip = _from_the_start(model, reader, episodes, horizon + 1)
     kept = clip.failure[:, 0] == SAFE
@@ -124,8 +124,8 @@ def imagined_episodes(
         "verdicts": balanced_accuracy(verdict, failed),
         "shuffled": balanced_accuracy(_fails(model, start, action[shuffled], valid[shuffled]), failed),
         "still": balanced_accuracy(held, failed),
-        "false_alarms": wilson(int(verdict[~failed].sum()), int((~failed).sum())),
-        "hold_false_alarms": wilson(int(held.sum()), len(failed)),
+        "false_alarms": share_of(verdict, ~failed),
+        "hold_false_alarms": share_of(held, np.ones_like(failed)),
     }
 
 
@@ -151,8 +151,8 @@ def foreseen_along(model: SafetyModel, reader: ClipReader, episodes: np.ndarray)
     return {
         "failing": int(failed.sum()),
         "safe": int((~failed).sum()),
-        "missed": wilson(int((~verdict[failed]).sum()), int(failed.sum())) if failed.any() else None,
-        "false_alarms": wilson(int(verdict[~failed].sum()), int((~failed).sum())) if not failed.all() else None,
+        "missed": share_of(~verdict, failed),
+        "false_alarms": share_of(verdict, ~failed),
     }
 
 
@@ -189,6 +189,11 @@ def _fails(model: SafetyModel, latent: Latent, action: Tensor, valid: Tensor) ->
         latent = model.world_model.step(latent, action[:, t])
         fails |= (model.imagination.margin(latent) < 0) & valid[:, t]
     return fails.cpu().numpy()
+
+
+def share_of(wrong: np.ndarray, among: np.ndarray) -> dict[str, float] | None:
+    """How many of some are wrong, both bool of one shape: {k, n, low, high}, or None where there are none."""
+    return wilson(int((wrong & among).sum()), int(among.sum())) if among.any() else None
 
 
 def balanced_accuracy(predicted: np.ndarray, truth: np.ndarray) -> float:

@@ -16,7 +16,6 @@ from torch import Tensor
 
 from lerobot_latentsafe.datasets.clips import ClipReader
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE
-from lerobot_latentsafe.evaluation.statistics import wilson
 from lerobot_latentsafe.evaluation.token_space import (
     ALL,
     SPACES,
@@ -28,7 +27,13 @@ from lerobot_latentsafe.evaluation.token_space import (
     moments,
     ticks_a_step,
 )
-from lerobot_latentsafe.evaluation.world_model import OBSERVED, imagined_episodes, known_along, whole_episodes
+from lerobot_latentsafe.evaluation.world_model import (
+    OBSERVED,
+    imagined_episodes,
+    known_along,
+    share_of,
+    whole_episodes,
+)
 from lerobot_latentsafe.modeling_latentsafe import load_filter
 from lerobot_latentsafe.safety_model import SafetyModel
 from lerobot_latentsafe.training import cached_reader
@@ -96,7 +101,8 @@ def compare_world_models(
             **{"world_model": None, "verdicts": None, "seen": None, **more},
         }
 
-    rows, deaf = {}, {}
+    rows: dict[str, dict] = {}
+    deaf: dict[str, dict] = {}
     for name, (model, reader) in models.items():
         steps, generator = max(1, horizon // ticks_a_step(model.config)), torch.Generator().manual_seed(seed)
         verdicts = imagined_episodes(model, reader, episodes, generator, steps)
@@ -217,11 +223,10 @@ def missed_failures(model: SafetyModel, reader: ClipReader, episodes: np.ndarray
     first = np.array([np.flatnonzero(reader.labels.episode == e)[0] for e in episodes])
     index = first[:, None] + ticks_a_step(model.config) * np.arange(alarm.shape[1])
     little = np.zeros_like(alarm) if few is None else few[np.minimum(index, len(few) - 1)]
-    rate = lambda wrong, of: wilson(int((wrong & of).sum()), int(of.sum())) if of.any() else None  # noqa: E731
     return {
-        "missed": rate(~alarm, failure == FAILING),
-        "few_missed": rate(~alarm, (failure == FAILING) & little),
-        "false_alarms": rate(alarm, failure == SAFE),
+        "missed": share_of(~alarm, failure == FAILING),
+        "few_missed": share_of(~alarm, (failure == FAILING) & little),
+        "false_alarms": share_of(alarm, failure == SAFE),
     }
 
 

@@ -143,7 +143,7 @@ def draw(models: dict[str, str], data: Path, path: Path) -> None:
     chosen = furthest_apart(space, states)
     shown = [moment for moment in moments(space.fps) if moment.name in DRAWN]
     rise = space.cache.state[chosen.follow + shown[-1].ticks, HEIGHT] - space.cache.state[chosen.follow, HEIGHT]
-    done = [f"hand {100 * metres:+.0f} cm in {shown[-1].name}" for metres in rise]
+    done = [f"hand {round(100 * metres):+d} cm in {shown[-1].name}" for metres in rise.tolist()]
     ahead = {moment.name: chosen.follow + moment.ticks for moment in shown}
     rows = {"recorded": ahead}
     for name, policy_path in models.items():
