@@ -60,6 +60,10 @@ class Branches(NamedTuple):
     follow: np.ndarray
     group: np.ndarray
 
+    def of(self, chosen: list[int]) -> "Branches":
+        """Some of them."""
+        return Branches(*(column[chosen] for column in self))
+
 
 def compare_world_models(
     policies: Mapping[str, str], meta: LeRobotDatasetMetadata, episodes: np.ndarray, branches: int = 0,

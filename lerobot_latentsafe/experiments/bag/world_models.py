@@ -10,7 +10,6 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
-import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
 from lerobot_latentsafe.collection.franka import SOURCES, episode_truths
@@ -19,7 +18,7 @@ from lerobot_latentsafe.datasets.folder import load_metadata
 from lerobot_latentsafe.datasets.labels import read_frames
 from lerobot_latentsafe.evaluation.statistics import provenance, wilson, write_json
 from lerobot_latentsafe.evaluation.token_space import Imagination, TokenSpace, moments
-from lerobot_latentsafe.evaluation.yardstick import Branches, branches_of, compare_world_models, loaded, summarised
+from lerobot_latentsafe.evaluation.yardstick import branches_of, compare_world_models, loaded, summarised
 from lerobot_latentsafe.franka.actions import STATE_NAMES
 from lerobot_latentsafe.reports.figures import imagined_futures, save
 from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
@@ -139,11 +138,12 @@ def draw(models: dict[str, str], data: Path, path: Path) -> None:
     """One state's future under three actions: as recorded, and as the recorded frames nearest to what is imagined."""
     meta, pictures = _tokens(data, "branches"), _pictures(data, "branches")
     space, picture = TokenSpace(meta), _camera(data / "held_branches")
-    states = branches_of(space, meta, np.arange(meta.total_episodes), SOURCES["bag_branches"].branches)
-    chosen = furthest_apart(space, states)
     shown = [moment for moment in moments(space.fps) if moment.name in DRAWN]
-    rise = space.cache.state[chosen.follow + shown[-1].ticks, HEIGHT] - space.cache.state[chosen.follow, HEIGHT]
-    done = [f"hand {round(100 * metres):+d} cm in {shown[-1].name}" for metres in rise.tolist()]
+    states = branches_of(space, meta, np.arange(meta.total_episodes), SOURCES[HELD["branches"][0]].branches)
+    height, last = space.cache.state[:, HEIGHT], shown[-1]
+    rise = height[states.follow + last.ticks] - height[states.follow]
+    best = furthest_apart(rise, states.group)
+    chosen, done = states.of(best), [f"hand {round(100 * rise[i]):+d} cm in {last.name}" for i in best]
     ahead = {moment.name: chosen.follow + moment.ticks for moment in shown}
     rows = {"recorded": ahead}
     for name, policy_path in models.items():
@@ -158,17 +158,11 @@ def draw(models: dict[str, str], data: Path, path: Path) -> None:
     save(imagined_futures(picture(chosen.start[0]), told, DRAWN), path)
 
 
-def furthest_apart(space: TokenSpace, branches: Branches) -> Branches:
-    """The N_DRAWN branches of one state whose last frames are least alike."""
-    last = max(moment.ticks for moment in moments(space.fps))
-    frames = space.basis(space.recorded(branches.follow + last))
-    trios = (
-        trio
-        for group in np.unique(branches.group)
-        for trio in combinations(np.flatnonzero(branches.group == group).tolist(), N_DRAWN)
-    )
-    best = list(max(trios, key=lambda trio: torch.pdist(frames[list(trio)]).min().item()))
-    return Branches(*(column[best] for column in branches))
+def furthest_apart(rise: np.ndarray, group: np.ndarray) -> list[int]:
+    """N_DRAWN branches of one state that differ most in how far the hand rises (B,), the highest first."""
+    order = np.argsort(-rise)
+    sets = (c for g in np.unique(group) for c in combinations(order[group[order] == g].tolist(), N_DRAWN))
+    return list(max(sets, key=lambda chosen: -np.diff(rise[list(chosen)]).max()))
 
 
 def _camera(root: Path) -> Callable[[int], np.ndarray]:
