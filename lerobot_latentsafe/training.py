@@ -141,6 +141,11 @@ def load_with_cache(path: str | Path, dataset_meta, seed: int = 0) -> tuple[Late
     """
     torch.manual_seed(seed)
     policy = load_filter(path)
+    return policy, cached_reader(policy, dataset_meta)
+
+
+def cached_reader(policy: LatentSafePolicy, dataset_meta) -> ClipReader:
+    """The reader of a cached dataset that fits a filter; errors as of `load_with_cache`."""
     config, trained_on = policy.config, policy.config.trained_on
     policy.model.require_stage("world_model")
     # The cache of the first stage may be gone; the dataset brings its own.
@@ -151,7 +156,7 @@ def load_with_cache(path: str | Path, dataset_meta, seed: int = 0) -> tuple[Late
     reader = data.reader(config.world_model, policy.model.units)
     reader.require_cache()
     config.world_model.of_cache(data.cache.manifest)
-    return policy, reader
+    return reader
 
 
 @torch.no_grad()

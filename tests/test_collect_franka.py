@@ -13,6 +13,8 @@ from lerobot_latentsafe.collection.franka import collect_franka as collect
 from lerobot_latentsafe.collection.interventions import BRIEF, RETREATING, Interventions
 from lerobot_latentsafe.datasets.labels import FailureLabels
 from lerobot_latentsafe.franka.actions import action_limits
+from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
+from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
 
 COLUMNS = ("observation.state", "action", "failure", "next.reward", "episode_index")
 
@@ -76,8 +78,6 @@ def test_several_workers_record_the_same(tiny, tmp_path, monkeypatch):
 
 
 def test_branches_share_their_grasp_and_differ_after_it():
-    from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
-    from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
 
     with LatentSafeFrankaMujoco(LatentSafeFrankaMujocoConfig(image_size=32)) as robot:
         first = {}
@@ -95,8 +95,6 @@ def test_what_the_operator_of_a_pushed_hand_wants_is_recorded(tiny):
     from dataclasses import replace
 
     from lerobot_latentsafe.franka.actions import action_limits
-    from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
-    from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
 
     low, high = action_limits(20)
     steady = SOURCES["tiny"]
@@ -142,8 +140,6 @@ class Closes:
 
 def test_a_policy_is_recorded_as_it_acts_and_is_overridden(tiny, monkeypatch):
     from lerobot_latentsafe.collection import policy_operator
-    from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
-    from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
 
     monkeypatch.setattr(policy_operator, "BasePolicy", Closes)
     franka._policy_operator.cache_clear()
@@ -166,8 +162,6 @@ def test_a_policy_is_recorded_as_it_acts_and_is_overridden(tiny, monkeypatch):
 
 def test_a_filter_may_say_when(tiny, tmp_path, monkeypatch):
     from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
-    from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
-    from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
 
     monkeypatch.setattr(Closes, "up", 0.01)
     monkeypatch.setattr(LatentSafePolicy, "attach", lambda self, path: setattr(self, "_base", [Closes()]))
@@ -190,8 +184,6 @@ def test_a_filter_may_say_when(tiny, tmp_path, monkeypatch):
 
 
 def test_somebody_intervenes_while_the_fingers_close_and_the_operator_goes_on(tiny):
-    from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
-    from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
 
     actions = {}
     for style in (None, RETREATING):
@@ -259,3 +251,13 @@ def test_a_full_disk_leaves_finished_parts(tiny, tmp_path, monkeypatch):
         collect("tiny", "me/tiny", tmp_path / "x", 2, seed=0)
     finished = LeRobotDataset("me/tiny", root=tmp_path / "x.parts" / "000000_000001")
     assert finished.num_episodes == 1
+
+
+def test_an_episode_that_is_played_again_tells_what_was_recorded(tiny):
+    with LatentSafeFrankaMujoco(LatentSafeFrankaMujocoConfig(scene="blocks", image_size=32)) as robot:
+        for episode in range(2):
+            recorded = [bool(f["failure"]) for f in franka.episode_frames(robot, SOURCES["tiny"], episode, seed=0)]
+            again = [bool(t["failure"]) for t in franka.episode_truths(robot, SOURCES["tiny"], episode, seed=0)]
+            assert np.array_equal(np.logical_or.accumulate(again), recorded) and (episode == 1 or any(recorded))
+        with pytest.raises(ValueError, match=r"bag_diffusion_weak.*only operators are played again"):
+            next(franka.episode_truths(robot, SOURCES["bag_policies"], 0, seed=0))

@@ -7,13 +7,19 @@ from pathlib import Path
 import numpy as np
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_latentsafe.cli.options import DatasetSource, DefaultPolicySource, OptionalDatasetSource, PolicySource
+from lerobot_latentsafe.cli.options import (
+    DatasetSource,
+    DefaultPolicySource,
+    OptionalDatasetSource,
+    OptionalPolicySource,
+)
 from lerobot_latentsafe.decision import LawOptions
 from lerobot_latentsafe.dubins.ground_truth import load_states, truth_on
 from lerobot_latentsafe.encoders.patch_encoders import load_encoder
 from lerobot_latentsafe.evaluation.rollouts import check_environment, compare
 from lerobot_latentsafe.evaluation.statistics import provenance, write_json
 from lerobot_latentsafe.evaluation.world_model import evaluate_world_model
+from lerobot_latentsafe.evaluation.yardstick import compare_world_models, summarised
 from lerobot_latentsafe.experiments.bag.features import draw_features, see_variants
 from lerobot_latentsafe.experiments.dubins.figures import trajectories, value_slices
 from lerobot_latentsafe.experiments.dubins.monitor import LatentMonitor, evaluate_monitor
@@ -156,9 +162,21 @@ class EvalWorldModel:
     foresees how it ends; and whether it foresees the next second from all along the way, with the filter's
     `law.history_frames`. On episodes that branch from one state (bag_branches) that takes obeying the action; on
     episodes that share one motion (bag_lifts) it takes looking. Read it beside a control that is blind.
+
+    Errors of one model are in a unit of its own. To compare several, of whatever kind, give --policies in place of
+    --policy.path: they are scored in one space, an encoder's tokens, beside controls that cannot be good.
+
+    latentsafe eval-world-model --policies='{gru: outputs/gru, dino_wm: outputs/dino_wm}' --branches=5 \
+      --dataset.repo_id=me/held_cache --dataset.root=data/held_tokens --json=outputs/world_models.json
     """
 
-    policy: PolicySource
+    policy: OptionalPolicySource = field(default_factory=OptionalPolicySource)
+    policies: dict[str, str] | None = None
+    """Several to compare: a name of each, and its folder, Hub id or name of a committed checkpoint."""
+    branches: int = 0
+    """So many episodes of the dataset that follow each other start from one state, as in bag_branches; 0: no two do."""
+    pictures: str | None = None
+    """Folder of the same dataset with a cache of pictures, for those of --policies that read pictures (rssm)."""
     dataset: DatasetSource = field(default_factory=DatasetSource)
     n_episodes: int = 200
     """Episodes used at most, the last ones of the dataset, if --dataset.episodes names none."""
@@ -172,9 +190,17 @@ class EvalWorldModel:
     def __post_init__(self) -> None:
         _require_episodes(self.n_episodes, self.seed)
         require_at_least("--horizon", self.horizon, 1)
+        require_at_least("--branches", self.branches, 0)
+        if (self.policy.path is None) == (not self.policies):
+            raise ValueError(
+                f"--policy.path is {self.policy.path}, --policies is {self.policies}; give one checkpoint, or several "
+                "with names: --policies='{gru: outputs/gru, dino_wm: outputs/dino_wm}'"
+            )
 
     def run(self) -> None:
         """Ask, print and write."""
+        if self.policies:
+            return self._compare(self.policies)
         policy, reader = load_with_cache(self.policy.path, self.dataset.metadata(), self.seed)
         episodes = self.dataset.of(reader.labels.episode, self.n_episodes)
         row = evaluate_world_model(policy.model, reader, episodes, self.seed, horizon=self.horizon)
@@ -186,13 +212,27 @@ class EvalWorldModel:
         if self.json:
             write_json(self.json, {**row, **provenance(seeds=[self.seed])})
 
+    def _compare(self, policies: dict[str, str]) -> None:
+        meta = self.dataset.metadata()
+        pictures = DatasetSource(root=self.pictures).metadata() if self.pictures else None
+        episodes = self.dataset.of(np.arange(meta.total_episodes), self.n_episodes)
+        rows = compare_world_models(
+            policies, meta, episodes, self.branches, pictures, horizon=self.horizon, seed=self.seed
+        )
+        summary = {name: summarised(row) for name, row in rows.items()}
+        for name, numbers in summary.items():
+            for what, number in numbers.items():
+                print(f"{name:22s} {what:14s} {_short(number)}")
+        if self.json:
+            write_json(self.json, {"summary": summary, "models": rows, **provenance(seeds=[self.seed])})
 
-def _short(number: float | dict) -> str:
+
+def _short(number: float | dict | None) -> str:
     if not isinstance(number, dict):
-        return f"{number:.3f}" if isinstance(number, float) else str(number)
+        return f"{number:.3f}" if isinstance(number, float) else "-" if number is None else str(number)
     if "k" in number:
         return f"{number['k']} of {number['n']}"
-    return "  ".join(f"{name} {value:.3f}" for name, value in number.items())
+    return "  ".join(f"{name} {_short(value)}" for name, value in number.items())
 
 
 @dataclass

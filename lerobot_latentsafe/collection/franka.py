@@ -17,7 +17,7 @@ from lerobot_latentsafe.collection.interventions import BRIEF, RETREATING, Inter
 from lerobot_latentsafe.collection.parts import record_in_parts
 from lerobot_latentsafe.collection.policy_operator import PolicyOperator
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE
-from lerobot_latentsafe.evaluation.rollouts import Choice, steps
+from lerobot_latentsafe.evaluation.rollouts import Choice, Step, steps
 from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES, action_limits, read_action
 from lerobot_latentsafe.franka.bag import BagScene
 from lerobot_latentsafe.franka.behaviors import GRASPED, grasp, stray
@@ -163,12 +163,9 @@ def _record(source: Source, repo_id: str, seed: int, episodes: range, root: Path
 
 def episode_frames(robot: LatentSafeFrankaMujoco, source: Source, episode: int, seed: int) -> Iterator[dict]:
     """The frames of an episode as `LeRobotDataset.add_frame` takes them; the first failing frame and all after fail."""
-    info, scene = SCENES[source.scene], robot.scene
-    pushes = _begin(robot, source, episode, _scene_seed(seed, source, episode))
-    failed = False
+    scene, pushes, failed = robot.scene, _begin(robot, source, episode, _scene_seed(seed, source, episode)), False
     with _operator(robot, source, episode) as operator:
-        actor = lambda seen: Choice(read_action(operator(seen), info.fps).delta)  # noqa: E731
-        for step in steps(PushedRobot(robot, pushes), actor):
+        for step in _steps(PushedRobot(robot, pushes), operator):
             failed |= bool(step.before["failure"])
             yield {
                 "observation.images.front": step.seen["front"],
@@ -182,6 +179,22 @@ def episode_frames(robot: LatentSafeFrankaMujoco, source: Source, episode: int, 
                 "next.done": np.array([False]),
                 "task": scene.task,
             }
+
+
+def episode_truths(robot: LatentSafeFrankaMujoco, source: Source, episode: int, seed: int) -> Iterator[dict]:
+    """What the scene knows at each frame of an episode, played again without pictures: more than was recorded.
+
+    Raises:
+        ValueError: it was recorded of policies, which need pictures.
+    """
+    if source.policies:
+        raise ValueError(
+            f"{', '.join(source.mix)} are policies, which look at pictures; only operators are played again"
+        )
+    pushes = _begin(robot, source, episode, _scene_seed(seed, source, episode))
+    with _operator(robot, source, episode) as operator:
+        for step in _steps(UnseenRobot(robot, pushes), operator):
+            yield step.before
 
 
 def _begin(robot: LatentSafeFrankaMujoco, source: Source, episode: int, scene_seed: int) -> np.ndarray:
@@ -262,6 +275,18 @@ class PushedRobot:
             pushed[6] = action[6]
         self.robot.send_action(dict(zip(ACTION_NAMES, np.clip(pushed, *action_limits(scene.fps)).tolist())))
         self.info, self.t = scene.truth(), self.t + 1
+
+
+class UnseenRobot(PushedRobot):
+    """The same without pictures, for operators who do not look at them."""
+
+    def observe(self) -> dict:
+        """Nothing."""
+        return {}
+
+
+def _steps(world: PushedRobot, operator: Callable[[dict], dict[str, float]]) -> Iterator[Step]:
+    return steps(world, lambda seen: Choice(read_action(operator(seen), world.robot.scene.fps).delta))
 
 
 def _scene_seed(seed: int, source: Source, episode: int) -> int:

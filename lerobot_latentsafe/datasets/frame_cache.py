@@ -116,7 +116,8 @@ class FrameCache:
         Args:
             names: of the percepts; by default all.
         """
-        return {name: self._read(name, index) for name in names or self.percepts}, torch.from_numpy(self.state[index])
+        names = list(self.percepts) if names is None else names
+        return {name: self._read(name, index) for name in names}, torch.from_numpy(self.state[index])
 
     def _read(self, name: str, index: np.ndarray) -> Tensor:
         numbers = torch.as_tensor(self.percepts[name][index])

@@ -81,6 +81,10 @@ class FrameBasis(nn.Module):
         _require_fitted(self.fitted)
         return (tokens.flatten(-2) - self.mean) @ self.axes
 
+    def lift(self, components: Tensor) -> Tensor:
+        """Components of frames (..., K) -> the flattened tokens (..., P C) nearest to the mean that have them."""
+        return components @ torch.linalg.solve(self.axes.T @ self.axes, self.axes.T) + self.mean
+
     @torch.no_grad()
     def fit(self, tokens: Tensor) -> None:
         """From a sample of frames' tokens (N, P, C)."""

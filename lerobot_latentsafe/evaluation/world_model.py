@@ -5,6 +5,8 @@ given against shuffled actions and against copying the last frame; verdicts on w
 happened; and all of it is meant to be read beside the same numbers of a model that sees no images.
 """
 
+from collections.abc import Iterator
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -103,7 +105,8 @@ def imagined_episodes(
 
     Returns:
         verdicts: balanced accuracy of "fails within `horizon` steps"; shuffled: the same under other episodes' actions;
-        false_alarms: of the episodes that do not fail; hold_false_alarms: of holding still instead.
+        still: the same if holding still is imagined whatever was done; false_alarms: of the episodes that do not fail;
+        hold_false_alarms: of holding still, which fails in none. None are shares of nothing.
     """
     clip = _from_the_start(model, reader, episodes, horizon + 1)
     kept = clip.failure[:, 0] == SAFE
@@ -114,15 +117,15 @@ def imagined_episodes(
     shuffled = torch.randperm(len(action), generator=generator)
     still = torch.where(model.units.frozen, clip.action[kept, :1], model.units.still)
     verdict = _fails(model, start, action, valid)
+    held = _fails(model, start, still.expand_as(action), torch.ones_like(valid))
     return {
         "failing": int(failed.sum()),
         "safe": int((~failed).sum()),
         "verdicts": balanced_accuracy(verdict, failed),
         "shuffled": balanced_accuracy(_fails(model, start, action[shuffled], valid[shuffled]), failed),
-        "false_alarms": wilson(int(verdict[~failed].sum()), int((~failed).sum())),
-        "hold_false_alarms": wilson(
-            int(_fails(model, start, still.expand_as(action), torch.ones_like(valid)).sum()), len(failed)
-        ),
+        "still": balanced_accuracy(held, failed),
+        "false_alarms": share_of(verdict, ~failed),
+        "hold_false_alarms": share_of(held, np.ones_like(failed)),
     }
 
 
@@ -136,23 +139,34 @@ def foreseen_along(model: SafetyModel, reader: ClipReader, episodes: np.ndarray)
         failing, safe: states, themselves safe, after which the episode fails within AHEAD steps or does not; missed,
         false_alarms: of these, or None where there are none.
     """
-    longest = max(int((reader.labels.episode == e).sum()) for e in episodes)
-    clip, belief, verdicts, outcomes = _from_the_start(model, reader, episodes, longest), Belief(), [], []
-    for t in range(longest - AHEAD):
-        belief = belief.after(lambda latent: _seen(model, latent, clip, t), model.config.law.history_frames)  # noqa: B023
+    clip, verdicts, outcomes = whole_episodes(model, reader, episodes), [], []
+    for t, latent in enumerate(known_along(model, clip, clip.state.shape[1] - AHEAD)):
         kept = (clip.failure[:, t] == SAFE) & clip.valid[:, t + AHEAD]
         if t % 2 or not kept.any():
             continue
         coming = slice(t + 1, t + 1 + AHEAD)
-        verdicts.append(_fails(model, select(belief.latent, kept), clip.action[kept, coming], clip.valid[kept, coming]))
+        verdicts.append(_fails(model, select(latent, kept), clip.action[kept, coming], clip.valid[kept, coming]))
         outcomes.append((clip.failure[kept, coming] == FAILING).any(1).cpu().numpy())
     verdict, failed = (np.concatenate([*rows, np.zeros(0, bool)]) for rows in (verdicts, outcomes))
     return {
         "failing": int(failed.sum()),
         "safe": int((~failed).sum()),
-        "missed": wilson(int((~verdict[failed]).sum()), int(failed.sum())) if failed.any() else None,
-        "false_alarms": wilson(int(verdict[~failed].sum()), int((~failed).sum())) if not failed.all() else None,
+        "missed": share_of(~verdict, failed),
+        "false_alarms": share_of(verdict, ~failed),
     }
+
+
+def whole_episodes(model: SafetyModel, reader: ClipReader, episodes: np.ndarray) -> Clip:
+    """All frames of each episode."""
+    return _from_the_start(model, reader, episodes, max(int((reader.labels.episode == e).sum()) for e in episodes))
+
+
+def known_along(model: SafetyModel, clip: Clip, n: int) -> Iterator[Latent]:
+    """The posteriors after each of the first n frames of whole episodes, as far back as a filter remembers."""
+    belief = Belief()
+    for t in range(n):
+        belief = belief.after(lambda latent: seen(model, latent, clip, t), model.config.law.history_frames)  # noqa: B023
+        yield belief.latent
 
 
 def _from_the_start(model: SafetyModel, reader: ClipReader, episodes: np.ndarray, length: int) -> Clip:
@@ -161,7 +175,7 @@ def _from_the_start(model: SafetyModel, reader: ClipReader, episodes: np.ndarray
     return reader.cut(first, model.world_model.percept_names, length=length)
 
 
-def _seen(model: SafetyModel, latent: Latent | None, clip: Clip, t: int) -> Latent:
+def seen(model: SafetyModel, latent: Latent | None, clip: Clip, t: int) -> Latent:
     """The posterior after frame t of clips."""
     action = clip.action[:, t] if latent is not None else model.units.first_action(clip.action[:, t])
     percepts = {key: value[:, t] for key, value in clip.percepts.items()}
@@ -175,6 +189,11 @@ def _fails(model: SafetyModel, latent: Latent, action: Tensor, valid: Tensor) ->
         latent = model.world_model.step(latent, action[:, t])
         fails |= (model.imagination.margin(latent) < 0) & valid[:, t]
     return fails.cpu().numpy()
+
+
+def share_of(wrong: np.ndarray, among: np.ndarray) -> dict[str, float] | None:
+    """How many of some are wrong, both bool of one shape: {k, n, low, high}, or None where there are none."""
+    return wilson(int((wrong & among).sum()), int(among.sum())) if among.any() else None
 
 
 def balanced_accuracy(predicted: np.ndarray, truth: np.ndarray) -> float:
@@ -202,5 +221,5 @@ def _filtered(model: SafetyModel, clip: Clip) -> Latent:
     """The latent after the first OBSERVED frames of each window."""
     latent = None
     for t in range(OBSERVED):
-        latent = _seen(model, latent, clip, t)
+        latent = seen(model, latent, clip, t)
     return latent

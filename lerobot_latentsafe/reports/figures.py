@@ -1,5 +1,7 @@
 """Pictures where people would rather look."""
 
+from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -87,6 +89,33 @@ def value_profiles(panels: dict[str, list[dict[str, list]]], epsilon: float, fps
         ax.set(title=title, xlabel="time (s)", ylim=(-1.05, 1.05))
     axes[0, 0].set(ylabel=f"V (dashed: epsilon = {epsilon:g})")
     figure.tight_layout()
+    return figure
+
+
+def imagined_futures(
+    seen: np.ndarray, rows: dict[str, dict[str, list[np.ndarray | None]]], moments: Sequence[str]
+) -> Figure:
+    """What follows one frame under different actions: a row for each who tells it, the actions side by side.
+
+    Args:
+        seen: (H, W, 3), the frame.
+        rows: who -> what is done -> a picture (H, W, 3) a moment; None where nothing is told.
+        moments: their names.
+    """
+    actions = list(next(iter(rows.values())))
+    shape = len(rows), 1 + len(actions) * len(moments)
+    figure, axes = plt.subplots(*shape, figsize=(1.1 * shape[1], 1.15 * shape[0] + 0.5), squeeze=False)
+    for row, (who, told) in zip(axes, rows.items()):
+        pictures = [seen, *(picture for done in actions for picture in told[done])]
+        for ax, picture in zip(row, pictures):
+            ax.set(xticks=[], yticks=[], frame_on=False)
+            if picture is not None:
+                ax.imshow(picture)
+        row[0].set_ylabel(who, fontsize=9)
+    axes[0, 0].set_title("seen", fontsize=9)
+    for i, (done, moment) in enumerate(product(actions, moments), 1):
+        axes[0, i].set_title(f"{done}\n{moment}" if moment == moments[0] else f"\n{moment}", fontsize=9, loc="left")
+    figure.subplots_adjust(wspace=0.04, hspace=0.04)
     return figure
 
 

@@ -94,6 +94,10 @@ class WorldModel(nn.Module, abc.ABC):
         """Features (N, D) as pictures, of a model that `draws`: camera key -> (N, 3, S, S), about in [0, 1]."""
         raise NotImplementedError(f"a {self.config.type} world model draws no pictures")
 
+    def tokens_of(self, latent: Latent) -> Tensor | None:
+        """The frozen encoder's tokens of the frame that a latent (B, ...) means: (B, P, C), None if it has none."""
+        return None
+
     @property
     def percept_names(self) -> list[str]:
         """Keys of what `perceive` returns."""

@@ -247,6 +247,10 @@ class DinoWM(TerminationHead):
         frame = [latent["vector"]] if self.config.frame_token else []
         return torch.cat([self.summary(latent["tokens"]), latent["context"], latent["state"], *frame], -1)
 
+    def tokens_of(self, latent: Latent) -> Tensor | None:
+        """The tokens (B, P, C) as they are; None if it is blind."""
+        return None if self.config.blind else latent["tokens"]
+
     def error(self, latent: Latent, percepts: dict[str, Tensor], state: Tensor) -> Tensor:
         """Mean squared error of the tokens (of the state, if blind): (B,)."""
         if self.config.blind:

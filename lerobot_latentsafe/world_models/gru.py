@@ -127,6 +127,14 @@ class FrameGRU(WorldModel):
         """hidden, vector and state side by side: (..., D)."""
         return torch.cat([latent["hidden"], latent["vector"], latent["state"]], -1)
 
+    def tokens_of(self, latent: Latent) -> Tensor | None:
+        """The components lifted to the tokens (B, P, C) that they stand for; None if it is blind."""
+        if self.config.blind:
+            return None
+        components = latent["vector"][..., : self.config.perception.components]
+        shape = (self.perception.n_patches, self.perception.token_dim)
+        return self.perception.basis.lift(components).unflatten(-1, shape)
+
     def ended(self, latent: Latent) -> Tensor:
         """Never: recordings do not end by themselves."""
         return torch.zeros(latent["hidden"].shape[:-1], dtype=torch.bool, device=latent["hidden"].device)
