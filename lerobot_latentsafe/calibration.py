@@ -44,7 +44,7 @@ def episode_values(model: SafetyModel, reader: ClipReader, episodes: np.ndarray)
     for episode in episodes:
         index = np.flatnonzero(reader.labels.episode == episode)
         # A clip from each of the first frames on, where a world model sees every so many.
-        clip = reader.cut(index[: reader.skip], model.world_model.percept_names, length=-(-len(index) // reader.skip))
+        clip = reader.cut(index[: reader.skip], model.world_model, length=-(-len(index) // reader.skip))
         latent = map_latent(model.world_model.encode(clip), lambda t: t.transpose(0, 1).flatten(0, 1))  # in order again
         value = model.value(latent)[: len(index)].cpu().numpy()
         rows.append({"value": value, "failure": reader.labels.failure[index]})

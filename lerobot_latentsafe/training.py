@@ -51,7 +51,7 @@ def seen_and_imagined(
     for _ in range(-(-n_clips // 64)):
         first = torch.randint(len(reader.labels.failure), (64,), generator=generator).numpy()
         first[:16] = begins[torch.randint(len(begins), (16,), generator=generator).numpy()]
-        clip = reader.cut(first, world_model.percept_names)
+        clip = reader.cut(first, world_model)
         observed = int(torch.randint(1, clip.state.shape[1] + 1, (), generator=generator))
         latent = None
         for t in range(clip.state.shape[1]):
@@ -182,7 +182,7 @@ def encoded_starts(
     single, filtered = [], []
     first = share(torch.from_numpy(first)).numpy()
     for chunk in np.array_split(first, max(1, len(first) // 64)):
-        clip = reader.cut(chunk, world_model.percept_names)
+        clip = reader.cut(chunk, world_model)
         kept = clip.valid.flatten()
         z = world_model.encode(clip)
         filtered.append(select({k: v.flatten(0, 1) for k, v in z.items()}, kept))

@@ -379,6 +379,11 @@ class Units(nn.Module):
         unknown = torch.full((1, len(self.state_mean)), torch.nan, device=self.device)
         return self.normalise_motions(torch.where(self.is_target, 0.0, self.hold(unknown)))
 
+    def still_as(self, action: Tensor) -> Tensor:
+        """Standing still for as many ticks as an action (..., K A) has, inside; frozen commands as they are there."""
+        ticks = action.unflatten(-1, (-1, len(self.frozen)))
+        return torch.where(self.frozen, ticks, self.still[0]).flatten(-2)
+
     def moves(self, state: Tensor, before: Tensor) -> Tensor:
         """Whether what each target is of moved from one state (B, S) to the next: bool (B, A)."""
         return self.seen(((state - before).abs() > self.rest).float()) > 0

@@ -105,7 +105,7 @@ def test_values_along_episodes_are_those_of_filtering(tiny_filter, cache_meta):
         index = np.flatnonzero(reader.labels.episode == episode)
         assert len(row["value"]) == len(index)
         np.testing.assert_array_equal(row["failure"], reader.labels.failure[index])
-        clip = reader.cut(index[:1], policy.model.world_model.percept_names)
+        clip = reader.cut(index[:1], policy.model.world_model)
         encoded = {key: value[0] for key, value in policy.model.world_model.encode(clip).items()}
         np.testing.assert_allclose(row["value"][:length], policy.model.value(encoded).detach(), atol=1e-5)
 
@@ -147,7 +147,7 @@ def test_episodes_start_with_the_grip_they_had(cache_meta):
     policy.config.law.name = "margin"
     policy.config.trained_on.stage = "world_model"
     index = np.flatnonzero(policy.reader.labels.episode == 2)
-    clip = policy.reader.cut(index[:1], policy.model.world_model.percept_names, length=len(index))
+    clip = policy.reader.cut(index[:1], policy.model.world_model, length=len(index))
     assert clip.action[0, 0, 0] == pytest.approx(
         policy.model.units.normalise_action(torch.from_numpy(policy.reader.cache.action[index[:1]]))[0, 0].item()
     )

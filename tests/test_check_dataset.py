@@ -184,7 +184,7 @@ def test_actions_of_two_axes_are_a_row_of_numbers(tmp_path):
     meta = cached(world.record(tmp_path / "data", world.features(action=kind)), tmp_path / "cache")
     policy = new_policy(meta)
     assert policy.config.action_feature.shape == (2,)
-    assert policy.reader.cut(np.array([0]), [world.CAMERA]).action.shape[-1] == 2
+    assert policy.reader.cut(np.array([0])).action.shape[-1] == 2
 
 
 def test_a_dataset_without_proprioception_is_cached_with_an_empty_state(tmp_path):

@@ -161,7 +161,7 @@ def test_a_failure_between_two_frames_counts(counting_root, tmp_path):
     failing = np.zeros(N, np.int64)
     failing[4] = 1  # between frames 3 and 6
     reader.labels = replace(reader.labels, failure=failing)
-    clip = reader.cut(np.array([0, 1, 3, 5]), [])
+    clip = reader.cut(np.array([0, 1, 3, 5]))
     assert clip.failure.tolist() == [[0, 0, 1], [0, 1, 0], [0, 1, 0], [0, 0, 0]]
 
 

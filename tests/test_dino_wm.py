@@ -272,6 +272,13 @@ def test_merged_patches_lie_side_by_side_camera_by_camera():
         assert merged[token].tolist() == [corner + number for number in expected]
 
 
+def test_merged_patches_come_apart_again():
+    model, tokens = build_merged(), torch.randn(2, GRID**2, TOKEN_DIM)
+    assert torch.equal(model._apart(model._merged(tokens)), tokens)
+    latent = {"tokens": model._merged(tokens), "vector": torch.zeros(2, tiny.COMPONENTS)}
+    assert torch.equal(model.tokens_of(latent), tokens)  # without an encoder, tokens are whole
+
+
 @pytest.mark.parametrize("conditioning", ["adaln", "concat"])
 @torch.no_grad()
 def test_streaming_with_a_frame_token_equals_the_full_forward(conditioning):

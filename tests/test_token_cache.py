@@ -205,6 +205,18 @@ def test_cached_components_are_those_at_deployment(component_root, dataset):
     assert cached["tokens"].shape == (3, 4, 6) and model.config.perception.token_components == 6
 
 
+def test_whole_tokens_are_cut_down_to_the_components_that_are_read(component_root, dataset, tmp_path):
+    build_frame_cache(dataset, tmp_path / "whole", tiny.TOKEN_SIZE, tiny.tokens(basis_from=component_root))
+    model, index = dino_wm_of(component_root), np.array([0, 5, 41])
+    whole, _ = FrameCache.open(tmp_path / "whole").frames(index, model.percept_names)
+    cached, _ = FrameCache.open(component_root).frames(index, model.percept_names)
+    torch.testing.assert_close(model.from_cache(whole)["tokens"], cached["tokens"], rtol=1e-2, atol=1e-2)
+    assert model.from_cache(cached)["tokens"] is cached["tokens"]
+    # What a latent stands for has the components that it tells of the whole frame.
+    latent = model.correct(model.initial(3), cached, torch.zeros(3, 2))
+    torch.testing.assert_close(model.basis(model.tokens_of(latent)), cached["vector"], rtol=1e-2, atol=1e-2)
+
+
 def test_the_more_components_the_nearer_to_the_tokens(dataset, token_root, component_root):
     whole = FrameCache.open(token_root).frames(np.arange(50))[0]["tokens"]
     errors = []

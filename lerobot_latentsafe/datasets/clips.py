@@ -54,6 +54,9 @@ class Eyes(Protocol):
     def perceive(self, images: dict[str, Tensor]) -> dict[str, Tensor]:
         """Camera key -> (B, C, H, W) in [0, 1] to name -> (B, ...)."""
 
+    def from_cache(self, cached: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Percepts of what a frame cache holds of frames: name -> (..., ...)."""
+
 
 class Seeing(Protocol):
     """What reads the pictures of a batch: a safety model."""
@@ -206,7 +209,7 @@ class ClipReader:
         """The clips of a LeRobot training batch."""
         index = batch["index"].reshape(-1).cpu().numpy()
         if self.cache is not None:
-            return self.cut(index, model.world_model.percept_names)
+            return self.cut(index, model.world_model)
         eyes = model.world_model
         window, valid = self._window(index, self.length)
         images = {k: model.images(batch[k]).flatten(0, 1) for k in eyes.image_keys}
@@ -218,12 +221,17 @@ class ClipReader:
         if self.cache is None:
             raise ValueError("this reads cached frames: run latentsafe cache and give its folder as --dataset.root")
 
-    def cut(self, start: np.ndarray, percept_names: list[str], length: int | None = None) -> Clip:
-        """Clips from the frame cache that start at the given frame indices (B,); by default of the training length."""
+    def cut(self, start: np.ndarray, eyes: Eyes | None = None, length: int | None = None) -> Clip:
+        """Clips from the frame cache that start at the given frame indices (B,); by default of the training length.
+
+        Args:
+            eyes: the world model that sees them; None: nobody does, and there are no percepts.
+        """
         self.require_cache()
         window, valid = self._window(start, length or self.length)
-        percepts, _ = self.cache.frames(window, percept_names)
-        return self._assemble(window, valid, {key: value.to(self.units.device) for key, value in percepts.items()})
+        cached, _ = self.cache.frames(window, eyes.percept_names if eyes else [])
+        cached = {key: value.to(self.units.device) for key, value in cached.items()}
+        return self._assemble(window, valid, eyes.from_cache(cached) if eyes else {})
 
     def _window(self, start: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarray]:
         """Frame indices (B, T) from each start on, and whether they are of its episode; if not, they stay at the last

@@ -55,12 +55,16 @@ class PerceptionConfig:
             ("basis_hash", "build the cache with --basis_from=<the cache that was trained on>"),
         ):
             known = getattr(self, name)
-            if known is not None and known != found.get(name, known):
+            if name == "token_components" and found[name] == 0:
+                continue  # whole tokens have all components
+            if known is not None and known != found[name]:
                 raise EncoderMismatchError(
                     f"the cache has {name} {found[name]}, the world model was made for {known}; {remedy}, or train anew"
                 )
-        adopted = ("encoder", "encoder_hash", "basis_hash", "token_components")
-        return replace(self, **{name: found[name] for name in adopted})
+        adopted = {name: found[name] for name in ("encoder", "encoder_hash", "basis_hash")}
+        if self.token_components is None:
+            adopted["token_components"] = found["token_components"]
+        return replace(self, **adopted)
 
 
 class FrameBasis(nn.Module):
@@ -221,8 +225,16 @@ class Perception(nn.Module):
                 "cache at this image size and with as many, or set world_model.perception.components"
             )
         self.basis.load_state_dict({key: found[key] for key in self.basis.state_dict()})
-        if self.patches is not None:
-            self.patches.load_state_dict({key: found[f"patches.{key}"] for key in self.patches.state_dict()})
+        if self.patches is None:
+            return
+        axes = found.get("patches.axes")
+        if axes is None or axes.shape != self.patches.axes.shape:
+            n, expected = 0 if axes is None else axes.shape[-1], self.patches.axes.shape[-1]
+            raise EncoderMismatchError(
+                f"{file} holds {n} components of each camera's tokens, expected {expected}; build the cache with as "
+                "many (latentsafe cache --token_components=...)"
+            )
+        self.patches.load_state_dict({key: found[f"patches.{key}"] for key in self.patches.state_dict()})
 
     def forward(self, images: dict[str, Tensor]) -> dict[str, Tensor]:
         """Camera key -> (B, 3, S, S) in [0, 1] to what is kept of the frames' tokens."""
@@ -230,4 +242,9 @@ class Perception(nn.Module):
 
     def kept(self, tokens: Tensor) -> dict[str, Tensor]:
         """Whole tokens (B, P, n_cameras x dim) -> what is kept of them, by name."""
-        return {"tokens": tokens if self.patches is None else self.patches(tokens), "vector": self.basis(tokens)}
+        return {"tokens": self.cut_down(tokens), "vector": self.basis(tokens)}
+
+    def cut_down(self, tokens: Tensor) -> Tensor:
+        """Tokens (..., P, C), whole or cut down already, as they are kept."""
+        whole = tokens.shape[-1] != self.token_dim
+        return self.patches(tokens) if whole and self.patches is not None else tokens

@@ -20,9 +20,9 @@ from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
 from lerobot_latentsafe.datasets.clips import ClipReader
 from lerobot_latentsafe.datasets.frame_cache import FrameCache, FrameCacheError, basis_file
 from lerobot_latentsafe.encoders.perception import FrameBasis, Perception, PerceptionConfig
-from lerobot_latentsafe.encoders.pictures import to_model_images
 from lerobot_latentsafe.evaluation.world_model import seen
 from lerobot_latentsafe.latent import Latent
+from lerobot_latentsafe.pictures import to_model_images
 from lerobot_latentsafe.safety_model import SafetyModel
 
 COMPONENTS, TOKENS = SPACES = ("frame components", "all tokens")
@@ -46,7 +46,7 @@ def moments(fps: int) -> list[Moment]:
 
 def ticks_a_step(config: LatentSafeConfig) -> int:
     """Recorded ticks that a step of a filter's world model takes."""
-    return getattr(config.world_model, "frame_skip", 1)
+    return config.world_model.frame_skip
 
 
 def steps_of(config: LatentSafeConfig, ticks: int) -> int | None:
@@ -126,7 +126,7 @@ class TokenSpace:
 
     def nearest(self, tokens: Tensor) -> np.ndarray:
         """Indices (N,) of the recorded frames whose components are nearest to those of tokens (N, P, C)."""
-        recorded = torch.from_numpy(np.array(self.cache.percepts["vector"]))
+        recorded = torch.from_numpy(np.array(self.cache.percepts["vector"])).float()
         return torch.cdist(self.basis(tokens), recorded).argmin(1).numpy()
 
 
@@ -165,16 +165,16 @@ class Imagination:
         model, config = self.model, self.model.config
         steps = {steps_of(config, moment.ticks): moment for moment in moments(self.space.fps)}
         latent = self._seen(start, observed)
-        action = self.reader.cut(follow, [], length=1 + max(n for n in steps if n)).action
-        still = model.imagination.complete(latent, model.units.still.expand_as(action[:, 0]))
+        action = self.reader.cut(follow, length=1 + max(n for n in steps if n)).action
+        still = model.units.still_as(action[:, 0])
         for t in range(1, action.shape[1]):
-            latent = model.imagination.step(latent, still if self.deaf else action[:, t])
+            latent = model.world_model.step(latent, still if self.deaf else action[:, t])
             if t in steps:
                 yield steps[t], self.space.imagined(model, latent)
 
     def _seen(self, start: np.ndarray, observed: int) -> Latent:
         first = start - (observed - 1) * ticks_a_step(self.model.config)
-        clip, latent = self.reader.cut(first, self.model.world_model.percept_names, length=observed), None
+        clip, latent = self.reader.cut(first, self.model.world_model, length=observed), None
         for t in range(observed):
             latent = seen(self.model, latent, clip, t)
         return latent

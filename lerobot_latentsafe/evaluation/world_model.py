@@ -21,7 +21,7 @@ HORIZONS = (1, 5, 10)
 OBSERVED = 4
 """Frames seen before imagination starts."""
 AHEAD = 15
-"""Steps that are imagined from states along an episode."""
+"""Ticks that are imagined from states along an episode."""
 
 
 def evaluate_world_model(
@@ -34,8 +34,9 @@ def evaluate_world_model(
         reader: of a cached dataset.
         episodes: their indices; each is also imagined from its first frame.
         n_windows: random windows within them, for the errors.
-        horizon: steps of an episode that are imagined.
+        horizon: ticks of an episode that are imagined.
     """
+    horizon = model.config.world_model.steps(horizon)
     generator = torch.Generator().manual_seed(seed)
     model.eval()
     return {
@@ -115,7 +116,7 @@ def imagined_episodes(
     start = model.world_model.observe(None, clip.action[kept, 0], percepts, clip.state[kept, 0])
     action, valid = clip.action[kept, 1:], clip.valid[kept, 1:]
     shuffled = torch.randperm(len(action), generator=generator)
-    still = torch.where(model.units.frozen, clip.action[kept, :1], model.units.still)
+    still = model.units.still_as(clip.action[kept, :1])
     verdict = _fails(model, start, action, valid)
     held = _fails(model, start, still.expand_as(action), torch.ones_like(valid))
     return {
@@ -136,15 +137,16 @@ def foreseen_along(model: SafetyModel, reader: ClipReader, episodes: np.ndarray)
     What a filter has seen grows with the episode, which what it was trained on did not.
 
     Returns:
-        failing, safe: states, themselves safe, after which the episode fails within AHEAD steps or does not; missed,
+        failing, safe: states, themselves safe, after which the episode fails within AHEAD ticks or does not; missed,
         false_alarms: of these, or None where there are none.
     """
     clip, verdicts, outcomes = whole_episodes(model, reader, episodes), [], []
-    for t, latent in enumerate(known_along(model, clip, clip.state.shape[1] - AHEAD)):
-        kept = (clip.failure[:, t] == SAFE) & clip.valid[:, t + AHEAD]
+    ahead = model.config.world_model.steps(AHEAD)
+    for t, latent in enumerate(known_along(model, clip, clip.state.shape[1] - ahead)):
+        kept = (clip.failure[:, t] == SAFE) & clip.valid[:, t + ahead]
         if t % 2 or not kept.any():
             continue
-        coming = slice(t + 1, t + 1 + AHEAD)
+        coming = slice(t + 1, t + 1 + ahead)
         verdicts.append(_fails(model, select(latent, kept), clip.action[kept, coming], clip.valid[kept, coming]))
         outcomes.append((clip.failure[kept, coming] == FAILING).any(1).cpu().numpy())
     verdict, failed = (np.concatenate([*rows, np.zeros(0, bool)]) for rows in (verdicts, outcomes))
@@ -157,22 +159,23 @@ def foreseen_along(model: SafetyModel, reader: ClipReader, episodes: np.ndarray)
 
 
 def whole_episodes(model: SafetyModel, reader: ClipReader, episodes: np.ndarray) -> Clip:
-    """All frames of each episode."""
-    return _from_the_start(model, reader, episodes, max(int((reader.labels.episode == e).sum()) for e in episodes))
+    """All frames of each episode that the world model sees."""
+    longest = max(int((reader.labels.episode == e).sum()) for e in episodes)
+    return _from_the_start(model, reader, episodes, model.config.world_model.steps(longest))
 
 
 def known_along(model: SafetyModel, clip: Clip, n: int) -> Iterator[Latent]:
     """The posteriors after each of the first n frames of whole episodes, as far back as a filter remembers."""
-    belief = Belief()
+    belief, history = Belief(), model.config.world_model.steps(model.config.law.history_frames)
     for t in range(n):
-        belief = belief.after(lambda latent: seen(model, latent, clip, t), model.config.law.history_frames)  # noqa: B023
+        belief = belief.after(lambda latent: seen(model, latent, clip, t), history)  # noqa: B023
         yield belief.latent
 
 
 def _from_the_start(model: SafetyModel, reader: ClipReader, episodes: np.ndarray, length: int) -> Clip:
     """The first frames of each episode."""
     first = np.array([np.flatnonzero(reader.labels.episode == e)[0] for e in episodes])
-    return reader.cut(first, model.world_model.percept_names, length=length)
+    return reader.cut(first, model.world_model, length=length)
 
 
 def seen(model: SafetyModel, latent: Latent | None, clip: Clip, t: int) -> Latent:
@@ -209,12 +212,14 @@ def _windows(
 ) -> Clip:
     """Random windows that lie within an episode."""
     index = np.flatnonzero(np.isin(reader.labels.episode, episodes))
-    index = index[index + length <= len(reader.labels.episode)]
-    inside = index[reader.labels.episode[index + length - 1] == reader.labels.episode[index]]
+    last = index + (length - 1) * reader.skip
+    index, last = (frames[last < len(reader.labels.episode)] for frames in (index, last))
+    inside = index[reader.labels.episode[last] == reader.labels.episode[index]]
     if not len(inside):
-        raise ValueError(f"no episode has {length} frames, which the errors at {HORIZONS} steps need")
+        n_frames = 1 + (length - 1) * reader.skip
+        raise ValueError(f"no episode has {n_frames} frames, which the errors at {HORIZONS} steps need")
     picked = torch.randint(len(inside), (n,), generator=generator).numpy()
-    return reader.cut(inside[picked], model.world_model.percept_names, length=length)
+    return reader.cut(inside[picked], model.world_model, length=length)
 
 
 def _filtered(model: SafetyModel, clip: Clip) -> Latent:

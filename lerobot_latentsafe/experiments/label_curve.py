@@ -93,7 +93,7 @@ def encode(model: SafetyModel, reader: ClipReader, first: np.ndarray) -> torch.T
     n, longest = len(reader.labels.episode), int(np.bincount(reader.labels.episode).max())
     features = torch.zeros(n, model.world_model.feature_dim)
     for chunk in np.array_split(first, -(-len(first) // 64)):
-        clip = reader.cut(chunk, model.world_model.percept_names, length=longest)
+        clip = reader.cut(chunk, model.world_model, length=longest)
         index = torch.from_numpy(chunk)[:, None] + torch.arange(longest)
         z = model.world_model.features(model.world_model.encode(clip))
         features[index[clip.valid.cpu()]] = z[clip.valid].cpu()

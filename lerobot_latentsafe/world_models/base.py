@@ -117,6 +117,10 @@ class WorldModel(nn.Module, abc.ABC):
         """
         return images
 
+    def from_cache(self, cached: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Percepts of what a frame cache holds of frames, name -> (..., ...): by default the same."""
+        return cached
+
     @abc.abstractmethod
     def correct(self, predicted: Latent, percepts: dict[str, Tensor], state: Tensor) -> Latent:
         """Posterior of a predicted latent given an observation: percepts (B, ...), state (B, S)."""

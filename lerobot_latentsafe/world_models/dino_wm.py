@@ -181,7 +181,7 @@ class DinoWM(TerminationHead):
             self.frame_decoder = _change_decoder(d, 2, n_components)
             self.sizes["vector"] = (n_components,)
             self.feature_dim += n_components
-        self.seen_names = [name for name in ("tokens", "vector", "state") if name in self.sizes]
+        self.seen_names: list[str] = [name for name in ("tokens", "vector", "state") if name in self.sizes]
         self.continues = nn.Sequential(nn.Linear(self.feature_dim, 64), nn.SiLU(), nn.Linear(64, 1))
 
     def _build_inputs(self, n_tokens: int, token_dim: int, state_dim: int) -> None:
@@ -248,8 +248,24 @@ class DinoWM(TerminationHead):
         return torch.cat([self.summary(latent["tokens"]), latent["context"], latent["state"], *frame], -1)
 
     def tokens_of(self, latent: Latent) -> Tensor | None:
-        """The tokens (B, P, C) as they are; None if it is blind."""
-        return None if self.config.blind else latent["tokens"]
+        """Whole tokens (B, patches, cameras x dim) that lie nearest to the data's mean and have what the latent tells.
+
+        None if it is blind.
+        """
+        if self.config.blind:
+            return None
+        tokens = self._apart(latent["tokens"])
+        if self.patches is not None:
+            tokens = self.patches.lift(tokens)
+        if self.basis is not None:  # the frame's components are foretold by themselves
+            missing = latent["vector"] - self.basis(tokens)
+            tokens = tokens + (self.basis.lift(missing) - self.basis.mean).unflatten(-1, tokens.shape[-2:])
+        return tokens
+
+    def from_cache(self, cached: dict[str, Tensor]) -> dict[str, Tensor]:
+        """With whole tokens cut down to the components that are read."""
+        perception = self._perception[0]
+        return cached if perception is None else {**cached, "tokens": perception.cut_down(cached["tokens"])}
 
     def error(self, latent: Latent, percepts: dict[str, Tensor], state: Tensor) -> Tensor:
         """Mean squared error of the tokens (of the state, if blind): (B,)."""
@@ -270,6 +286,14 @@ class DinoWM(TerminationHead):
             return tokens
         apart = tokens.unflatten(-1, (len(self.image_keys), -1)).unflatten(-3, (rows, m, columns, m))
         return apart.movedim((-6, -4, -2), (-6, -5, -4)).flatten(-4).flatten(-3, -2)
+
+    def _apart(self, tokens: Tensor) -> Tensor:
+        """The inverse of `_merged`."""
+        rows, columns, m = self._grid
+        if m == 1:
+            return tokens
+        apart = tokens.unflatten(-1, (len(self.image_keys), m, m, -1)).unflatten(-5, (rows, columns))
+        return apart.movedim((-6, -5, -4), (-6, -4, -2)).flatten(-2).flatten(-5, -2)
 
     def _advance(
         self, frames: dict[str, Tensor], action: Tensor, seen: Tensor, *, past: list[Tensor] | None = None

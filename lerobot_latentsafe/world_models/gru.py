@@ -132,8 +132,12 @@ class FrameGRU(WorldModel):
         if self.config.blind:
             return None
         components = latent["vector"][..., : self.config.perception.components]
-        shape = (self.perception.n_patches, self.perception.token_dim)
-        return self.perception.basis.lift(components).unflatten(-1, shape)
+        return self.perception.basis.lift(components).unflatten(-1, (self.perception.n_patches, -1))
+
+    def from_cache(self, cached: dict[str, Tensor]) -> dict[str, Tensor]:
+        """With whole tokens, if a summary is learned of them, cut down to the components that are read."""
+        cut = {"tokens": self.perception.cut_down(cached["tokens"])} if "tokens" in cached else {}
+        return {**cached, **cut}
 
     def ended(self, latent: Latent) -> Tensor:
         """Never: recordings do not end by themselves."""

@@ -38,7 +38,7 @@ def states(model: SafetyModel, held: list[Path]) -> dict[str, Latent]:
         reader = _reader(model, root)
         for episode in np.unique(reader.labels.episode):
             index = np.flatnonzero(reader.labels.episode == episode)
-            clip = reader.cut(index[:1], model.world_model.percept_names, length=len(index))
+            clip = reader.cut(index[:1], model.world_model, length=len(index))
             rows.append(map_latent(model.world_model.encode(clip), lambda t: t[0, 2::EVERY]))
     seen = {key: torch.cat([row[key] for row in rows]) for key in rows[0]}
     risen, up = seen, model.critic.high

@@ -84,9 +84,23 @@ def paper_steps(path: Path) -> tuple[dict[str, Callable[[], object]], float]:
     }, difference
 
 
+COMPACT = DinoWMConfig(
+    clip_length=9,
+    frame_skip=1,
+    dim=96,
+    depth=3,
+    heads=3,
+    mlp=384,
+    merge_patches=1,
+    frame_token=False,
+    change_weight=0.7,
+)
+"""36 tokens of two cameras, every tick: what was compared with the authors' predictor at a size for two cores."""
+
+
 def compact_steps(path: Path, n_episodes: int) -> dict[str, tuple[Callable[[], object], int, int]]:
     """What is timed at the compact size, how often a round, and the episodes that each call advances by a step."""
-    config = DinoWMConfig()
+    config = COMPACT
     n_patches, token_dim = 36, 224
     model = DinoWM(config, CAMERAS, STATE_DIM, ACTION_DIM, n_patches, token_dim).eval()
     theirs = authors_predictor(path, n_patches, config, config.dim)
@@ -96,11 +110,12 @@ def compact_steps(path: Path, n_episodes: int) -> dict[str, tuple[Callable[[], o
         latents = {name: value[:, -1] for name, value in model.encode(clip).items()}
         one = {name: value.clone() for name, value in select(latents, slice(1)).items()}
     action, seen = clip.action[:, -1], torch.arange(1, config.history + 1)[None]
-    tokens, state, before = (t[:1, : config.history] for t in (clip.percepts["tokens"], clip.state, clip.action))
+    before = clip.action[:1, : config.history]
+    frames = {name: t[:1, : config.history] for name, t in (("tokens", clip.percepts["tokens"]), ("state", clip.state))}
     return {
         "batch": (torch.no_grad()(lambda: model.step(latents, action)), 4, n_episodes),
         "one": (torch.no_grad()(lambda: model.step(one, action[:1])), n_episodes, 1),
-        "one_window": (torch.no_grad()(lambda: model._advance(tokens, state, before, seen)), n_episodes, 1),
+        "one_window": (torch.no_grad()(lambda: model._advance(frames, before, seen)), n_episodes, 1),
         "authors_compact": (lambda: theirs.train()(window), n_episodes, 1),
     }
 
@@ -170,7 +185,7 @@ def measure(authors: Path, rounds: int, n_episodes: int) -> dict:
     again = {f"{name}_kept_memory": (function, 1, 1) for name, function in paper.items()}
     times |= in_turn(again, rounds)
     times |= in_turn(compact_steps(authors, n_episodes), rounds)
-    training = {"compact, 16 clips": trained_step(DinoWMConfig(), 16, 36, 224)}
+    training = {"compact, 16 clips": trained_step(COMPACT, 16, 36, 224)}
     training["paper, 1 clip"] = trained_step(paper_config(), 1, 256, 768)
     return {
         "what": "CPU milliseconds (user and system): a step of the predictor; at compact size per episode and step",

@@ -261,7 +261,7 @@ class DreamerTraining:
             rng.integers(n_demonstrated, size=options.batch_size),
             rng.integers(min(n_demonstrated, n_frames - 1), n_frames, size=options.batch_size),
         )
-        clip = reader.cut(first, model.world_model.percept_names)
+        clip = reader.cut(first, model.world_model)
         ahead = first[:, None] + np.arange(reader.length)
         window = np.minimum(ahead, n_frames - 1)
         reward = config.rewards.reward(torch.from_numpy(self.replay.arrays["terms"][window]))
