@@ -169,7 +169,7 @@ EDITS = {
 @pytest.mark.parametrize("what", EDITS)
 @pytest.mark.fault("C13", "the critic's activation is edited in config.json", "Refused (`CheckpointError`)")
 @pytest.mark.fault("C14", "the camera's proportions are edited in config.json", "Refused (`CheckpointError`)")
-@pytest.mark.fault("C14", "what an action is is edited in config.json", "Refused (`CheckpointError`)")
+@pytest.mark.fault("C14", "output_features is edited in config.json", "Refused (`CheckpointError`)")
 def test_what_decides_is_sealed(filter_copy, what):
     edit(filter_copy / "config.json", EDITS[what])
     with pytest.raises(CheckpointError, match=r"config\.json was edited"):
