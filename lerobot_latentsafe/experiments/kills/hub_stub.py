@@ -68,6 +68,10 @@ class _Handler(BaseHTTPRequestHandler):
     def log_message(self, *_):
         pass
 
+    def handle(self):
+        with suppress(ConnectionError):  # who asked may be killed
+            super().handle()
+
     def do_any(self):
         path, body = unquote(urlparse(self.path).path), self._body()
         if body is None:
@@ -113,10 +117,9 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_response(status)
         for name, value in {"Content-Length": len(raw), "Content-Type": "application/json", **(headers or {})}.items():
             self.send_header(name, str(value))
-        with suppress(ConnectionError):  # who asked may be gone
-            self.end_headers()
-            if self.command != "HEAD":
-                self.wfile.write(raw)
+        self.end_headers()
+        if self.command != "HEAD":
+            self.wfile.write(raw)
 
     # -- pushing ---
 
