@@ -290,10 +290,10 @@ class Guard:
         return None
 
     def _lacks(self, missing: list[str], observation: dict[str, Any]) -> str:
+        got = ", ".join(key for key in map(str, observation) if key.startswith("observation"))
         return (
-            f"observation lacks {', '.join(missing)}; this filter was trained on {', '.join(self.model.inputs)}. Got "
-            f"{', '.join(key for key in observation if key.startswith('observation'))}. Rename the camera or state "
-            "(--rename_map), or train a filter for this robot"
+            f"observation lacks {', '.join(missing)}; this filter was trained on {', '.join(self.model.inputs)}. "
+            f"Got {got}. Rename the camera or state (--rename_map), or train a filter for this robot"
         )
 
     # -- what the robots are to do ---
@@ -309,6 +309,9 @@ class Guard:
         units = self.model.units
         if proposed is not None and not self._is_action(proposed, hold):
             proposed, missing_reason = None, Reason.BASE_POLICY_FAILED
+        if planned is not None and not self._is_plan(planned, hold):
+            proposed = planned = None
+            missing_reason = Reason.BASE_POLICY_FAILED
         if proposed is None:
             fault = torch.where(fault == Reason.PASSED, int(missing_reason), fault)
             proposed = hold
@@ -343,6 +346,14 @@ class Guard:
             f"proposed action is {_kind(proposed)}, expected a tensor of shape {tuple(hold.shape)}: "
             f"{', '.join(self.model.units.action_names)}. The base policy must be of the filter's action space"
         )
+        return False
+
+    def _is_plan(self, planned: Any, hold: Tensor) -> bool:
+        if isinstance(planned, Tensor) and _holds_numbers(planned):
+            n, size = hold.shape
+            if planned.dim() == 3 and planned.shape[0] == n and planned.shape[2] == size:
+                return True
+        self.say_once(f"the actions planned are {_kind(planned)}, expected one of (robots, actions, {hold.shape[1]})")
         return False
 
     def _tell_clipped(self, proposed: Tensor, clipped: Tensor, fault: Tensor) -> Tensor:
@@ -388,6 +399,8 @@ class Guard:
         """Take over what another guard remembers of the same robots."""
         for name in ("pose", "missed", "unwound", "told", "moving", "stay", "holding", "_proposals"):
             setattr(self, name, copy.copy(getattr(other, name)))
+        self.cameras.adopt(other.cameras)
+        self.response = copy.copy(other.response)
 
     def say_once(self, what: str, which: str = "") -> None:
         """Warn of something, once."""
@@ -397,7 +410,9 @@ class Guard:
 
 
 def _holds_numbers(tensor: Tensor) -> bool:
-    return tensor.dtype != torch.bool and not tensor.is_complex()
+    """Whether a tensor is an array of numbers: none of sparse, quantized or nested ones, nor one without data."""
+    plain = tensor.layout == torch.strided and not (tensor.is_quantized or tensor.is_nested or tensor.is_meta)
+    return plain and tensor.dtype != torch.bool and not tensor.is_complex()
 
 
 def _kind(value: Any) -> str:

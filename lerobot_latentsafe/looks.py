@@ -7,6 +7,7 @@ threshold comes from the dataset, with a factor of safety, such that no frame of
 apart is not tested.
 """
 
+import copy
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -292,6 +293,10 @@ class Cameras:
         old = (went > allowed).any(-1)
         self._repeats = (self._repeats + 1) * old
         return (self._repeats >= REPEATS).any(1)
+
+    def adopt(self, other: "Cameras") -> None:
+        """Take over what others remember of the same cameras."""
+        self._stream, self._repeats = copy.copy(other._stream), other._repeats
 
     @property
     def wrong(self) -> list[str]:

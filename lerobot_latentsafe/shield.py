@@ -4,7 +4,6 @@ The policy wrapper and every other adapter share this one core. Its rule: nothin
 in range and familiar ever counts as safe; and whatever fails, there is a decision.
 """
 
-import copy
 import logging
 import math
 import threading
@@ -171,7 +170,8 @@ class Shield:
             hold = self.guard.hold(seen.state)
             faults, proposed, clipped = self.guard.check_action(proposed, faults, hold, missing_reason, planned)
             for found in (fault, rate):
-                faults = first_fault(faults, torch.ones_like(faults, dtype=torch.bool), found)
+                if found != Reason.PASSED:
+                    faults = first_fault(faults, torch.ones_like(faults, dtype=torch.bool), found)
             self.overrides = self.overrides or Overrides(len(hold), hold.device)
             # What is wrong is not judged: in its place stands what would be done instead, to stay.
             judged = self._hear(torch.where((faults != Reason.PASSED)[:, None], hold, clipped))
@@ -259,11 +259,11 @@ class Shield:
     ) -> FilterDecision:
         """The law's decision, once all that can be known is known."""
         law, value = self.model.config.law, judgement.value
-        threshold = self.overrides.threshold(law)
-        fallback = torch.where(self._stays(faults, value, threshold, seen.state), hold, judgement.fallback)
         monitors = law.mode == "monitor"
         if law.name == "guard":
             return by_checks_alone(proposed, hold, faults, monitors, clipped)
+        threshold = self.overrides.threshold(law)
+        fallback = torch.where(self._stays(faults, value, threshold, seen.state), hold, judgement.fallback)
         return least_restrictive(proposed, fallback, value, judgement.margin, threshold, faults, monitors, clipped)
 
     def _remember(self, judgement: Judgement, decision: FilterDecision, observation: dict[str, Any]) -> None:
@@ -348,8 +348,9 @@ class Shield:
             with self._lock, other._lock:
                 if not (other._decided(observation, action) and self._accepts(other)):
                     continue
-                for name in ("beliefs", "executed", "observed", "decision", "overrides"):
-                    setattr(self, name, copy.copy(getattr(other, name)))
+                self.beliefs, self.executed = other.beliefs.copy(), other.executed.copy()
+                for name in ("observed", "decision", "overrides"):
+                    setattr(self, name, getattr(other, name))
                 self.guard.adopt(other.guard)
                 return self.decision
         return None

@@ -89,6 +89,8 @@ STATES: dict[str, Callable[[Tensor], Any]] = {
     "a state without a batch": lambda x: x[0],
     "a state of truth values": lambda x: x > 0,
     "a state of complex numbers": lambda x: x.to(torch.complex64),
+    "a state that is sparse": lambda x: x.to_sparse(),
+    "a state without data": lambda x: x.to("meta"),
     "a state that is a list": lambda x: x.tolist(),
     "a state in words": lambda x: "home",
 }
@@ -111,6 +113,8 @@ PICTURES: dict[str, Callable[[Tensor], Any]] = {
     "a picture without a batch": lambda x: x[0],
     "a picture of other proportions": lambda x: x[..., : x.shape[-1] // 2],
     "a picture without pixels": lambda x: x[..., :0, :0],
+    "a picture that is sparse": lambda x: x.to_sparse(),
+    "a picture without data": lambda x: x.to("meta"),
     "a picture that is an array": lambda x: x.numpy(),
     "a picture that is a path": lambda x: "picture.png",
 }
@@ -153,6 +157,8 @@ PROPOSALS: dict[str, Callable[[Tensor], Any]] = {
     "a proposal that is an array": lambda x: x.numpy(),
     "a proposal that is a list": lambda x: x.tolist(),
     "a proposal of complex numbers": lambda x: x.to(torch.complex64),
+    "a proposal that is sparse": lambda x: x.to_sparse(),
+    "a proposal that is quantized": lambda x: torch.quantize_per_tensor(x, 0.1, 0, torch.qint8),
 }
 """Name -> what it makes of a proposal (B, A)."""
 
