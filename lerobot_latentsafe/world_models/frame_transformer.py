@@ -109,7 +109,8 @@ class _Block(nn.Module):
         n, history = batch * length, past.shape[1] + 1
         query, new = self.qkv(x).split([self.inner, 2 * self.inner], -1)
         kept = torch.cat([past, new], 1)
-        window = kept.unfold(1, history, 1).movedim(-1, 2)  # (B, T, H, P, 2 K); a view if T is 1
+        # (B, T, H, P, 2 K); of a single frame without unfold, whose gradient is slow
+        window = kept.unsqueeze(1) if length == 1 else kept.unfold(1, history, 1).movedim(-1, 2)
         key, value = window.reshape(n, history * n_patches, 2, self.heads, -1).unbind(2)
         key = _rotate(key.unflatten(1, (history, n_patches)), rotation[:, None, None]).flatten(1, 2)
         query = query.reshape(n, n_patches, self.heads, -1)
