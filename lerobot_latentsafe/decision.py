@@ -119,7 +119,7 @@ class LawConfig:
         expected = {
             "name": (self.name in LAWS, f"one of {', '.join(LAWS)}"),
             "mode": (self.mode in MODES, f"one of {', '.join(MODES)}"),
-            "lookahead": (0 <= self.lookahead <= 25, "0 (critic alone) to 25 imagined steps"),
+            "lookahead": (0 <= self.lookahead <= 25, "0 (critic alone) to 25 imagined ticks"),
             "proposal_steps": (1 <= self.proposal_steps <= 25, "1 (the paper's law) to 25 steps"),
             "retreat_after": (0 <= self.retreat_after <= RECENT, f"0 (retreat at once) to {RECENT} overrides"),
             "min_retreat_steps": (self.min_retreat_steps >= 1, "at least 1 step"),

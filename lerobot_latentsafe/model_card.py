@@ -194,7 +194,7 @@ def _judgement(config: LatentSafeConfig) -> dict[str, str]:
         "world model": _world_model(config),
         "failure specification": _code(config.margin.failure_specification),
         "stage": config.trained_on.stage,
-        "law": f"{law.name}, V read after {law.proposal_steps} + {law.lookahead} imagined steps",
+        "law": f"{law.name}, V read {_ahead(config)}",
         "epsilon": threshold(law),
         "epsilon was set": _calibration(config.calibration),
         "fallback": _said(fallback(law)),
@@ -234,6 +234,15 @@ def _world_model(config: LatentSafeConfig) -> str:
         text += f" (weights {_said(perception.encoder_hash)}), which is not part of the checkpoint"
     frames = config.law.history_frames
     return text + (f"; remembers {frames} frames at most" if frames else "")
+
+
+def _ahead(config: LatentSafeConfig) -> str:
+    """How far ahead V is read, in words."""
+    ticks, skip = config.law.proposal_steps + config.law.lookahead, config.world_model.frame_skip
+    text = f"after {config.law.proposal_steps} + {config.law.lookahead} imagined ticks"
+    if config.trained_on.fps:
+        text += f", {ticks / config.trained_on.fps:.2g} s ahead"
+    return text + (f" (a step of the world model is {skip} ticks)" if skip > 1 else "")
 
 
 def _imagination(samples: int) -> str:

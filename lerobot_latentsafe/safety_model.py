@@ -177,7 +177,7 @@ class SafetyModel(nn.Module):
     def plan(self, latent: Latent) -> tuple[Tensor, Tensor]:
         """The safety value V(z), and the fallback action in [-1, 1]: (B,), (B, A).
 
-        min(l, max_a Q) of the critic (Eq. 4), read after `law.lookahead` imagined steps of the best of a few policies;
+        min(l, max_a Q) of the critic (Eq. 4), read after `law.lookahead` imagined ticks of the best of a few policies;
         or what `law.name` says instead.
         """
         self.require_trained_for_law()
