@@ -215,6 +215,11 @@ class Perception(nn.Module):
         kept = {} if self.patches is None else {f"patches.{key}": t for key, t in self.patches.state_dict().items()}
         return {**self.basis.state_dict(), **kept}
 
+    @classmethod
+    def forget(cls) -> None:
+        """Forget the pictures encoded last."""
+        cls._latest.clear()
+
     def load_basis(self, file: Path) -> None:
         """Principal components from a file of a token cache."""
         found = load_file(file)
