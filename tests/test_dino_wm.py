@@ -383,7 +383,9 @@ def test_the_papers_sizes_train_save_load_and_stream(tmp_path):
     ("options", "message"),
     [
         ({"conditioning": "add"}, r"'add'.*adaln, concat"),
-        ({"clip_length": 1}, "clip_length is 1.*2 frames"),
+        ({"clip_length": 3}, "clip_length is 3.*history=3 frames needs at least 4"),
+        ({"history": 0}, "history is 0.*at least 1"),
+        ({"frame_percept": "cls"}, "'cls'; expected one of components, class"),
         ({"head_dim": 7}, "head_dim is 7.*even"),
         ({"conditioning": "concat", "embedding": 16}, "dim is 32.*embedding=16"),
     ],

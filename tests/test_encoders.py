@@ -5,6 +5,7 @@ import sys
 from types import ModuleType
 
 import pytest
+import tiny
 import torch
 
 from lerobot_latentsafe.encoders import patch_encoders
@@ -18,8 +19,8 @@ def lite():
 
 
 def test_bundled_trunk_gives_a_token_for_each_16_pixels(lite):
-    tokens = lite(torch.rand(2, 3, 96, 96))
-    assert tokens.shape == (2, 36, 112) and tokens.isfinite().all()
+    tokens, class_token = lite(torch.rand(2, 3, lite.image_size, lite.image_size))
+    assert tokens.shape == (2, 36, 112) and tokens.isfinite().all() and class_token is None
     assert not any(p.requires_grad for p in lite.parameters())
 
 
@@ -28,7 +29,7 @@ def test_tokens_stand_for_their_patch(lite):
     image = torch.full((1, 3, 96, 96), 0.5)
     painted = image.clone()
     painted[..., 70:96, 70:96] = torch.tensor([1.0, 0.0, 0.0])[:, None, None]
-    change = (lite(painted) - lite(image)).square().sum(-1).view(6, 6)
+    change = (lite(painted).tokens - lite(image).tokens).square().sum(-1).view(6, 6)
     assert change[4:, 4:].mean() > 5 * change[:3, :3].mean()
 
 
@@ -54,9 +55,14 @@ def test_weights_have_a_hash_and_another_is_refused(lite):
 
 
 def test_images_must_be_square_and_a_multiple_of_the_patch(lite):
-    for shape in ((96, 80), (90, 90)):
-        with pytest.raises(ValueError, match="multiple of 16 pixels"):
+    for shape, near in (((96, 80), 96), ((90, 90), 96), ((4, 4), 16)):
+        with pytest.raises(ValueError, match=f"multiple of 16 pixels.*such as {near}"):
             lite(torch.rand(1, 3, *shape))
+
+
+def test_an_image_size_that_patches_do_not_fill_is_refused_before_any_picture():
+    with pytest.raises(ValueError, match=r"multiple of 16 pixels, got \(100, 100\).*such as 96"):
+        Perception(PerceptionConfig("efficientnet_lite0"), ["front"], 100)
 
 
 def test_training_mode_leaves_it_alone(lite):
@@ -107,17 +113,53 @@ def test_an_encoder_that_a_checkpoint_names_is_not_fetched_and_runs_no_code(monk
     assert all(options["trust_remote_code"] is False and options["use_safetensors"] for _, options in asked)
 
 
-@pytest.mark.parametrize("registers", [0, 4])
-def test_dino_from_a_folder_skips_what_stands_for_no_patch(tmp_path, registers):
+# -- DINO ---
+
+
+@pytest.fixture(scope="module", params=tiny.DINO)
+def dino(request, tmp_path_factory):
+    """A tiny random one of each kind, from a folder."""
+    return load_encoder(tiny.save_dino(tmp_path_factory.mktemp("dino"), request.param))
+
+
+def test_dino_gives_a_token_a_patch_and_one_of_the_whole_image(dino):
+    assert dino.image_size == 224 and dino.has_class_token
+    for n_patches, size in ((16, 4 * dino.patch), ((224 // dino.patch) ** 2, 224)):
+        tokens, class_token = dino(torch.rand(2, 3, size, size))
+        assert tokens.shape == (2, n_patches, dino.dim) and class_token.shape == (2, dino.dim)
+
+
+def test_tokens_of_dino_stand_for_their_patch(dino):
+    """Without layers that mix them, a token depends on its own pixels alone, and the class token on none."""
+    layers = next(m for m in dino.model.modules() if isinstance(m, torch.nn.ModuleList))
+    mixing, layers._modules = layers._modules, {}
+    image = torch.rand(1, 3, 4 * dino.patch, 4 * dino.patch)
+    painted = image.clone()
+    painted[..., dino.patch : 2 * dino.patch, -dino.patch :] = 0  # row 1, column 3
+    change, of_class = (after - before for after, before in zip(dino(painted), dino(image)))
+    layers._modules = mixing
+    assert change.abs().sum(-1).nonzero().tolist() == [[0, 7]] and not of_class.any()
+
+
+def test_class_tokens_of_cameras_lie_side_by_side_on_one_scale(dino):
+    perception = Perception(PerceptionConfig(dino.name, components=2), ["wrist", "front"], 2 * dino.patch)
+    images = {key: torch.rand(5, 3, perception.image_size, perception.image_size) for key in ("wrist", "front")}
+    seen = perception.see(images)
+    torch.testing.assert_close(seen.class_token[:, : dino.dim], dino(images["front"]).class_token)
+    with pytest.raises(RuntimeError, match="no principal components yet"):
+        perception(images)
+    perception.fit(seen)
+    scaled = perception(images)["class"].unflatten(-1, (2, dino.dim))
+    torch.testing.assert_close(scaled.mean(0), torch.zeros(2, dino.dim), atol=1e-5, rtol=0)
+    torch.testing.assert_close(scaled.square().mean((0, 2)), torch.ones(2), atol=1e-4, rtol=0)
+
+
+def test_a_model_that_is_no_dino_is_refused(tmp_path):
     transformers = pytest.importorskip("transformers")
-    sizes = dict(hidden_size=16, num_hidden_layers=1, num_attention_heads=2, image_size=28, patch_size=14)
-    if registers:
-        config = transformers.Dinov2WithRegistersConfig(**sizes, num_register_tokens=registers)
-    else:
-        config = transformers.Dinov2Config(**sizes)
+    config = transformers.ViTConfig(hidden_size=16, num_hidden_layers=1, num_attention_heads=2, intermediate_size=16)
     transformers.AutoModel.from_config(config).save_pretrained(tmp_path)
-    encoder = load_encoder(str(tmp_path))
-    assert encoder(torch.rand(2, 3, 56, 56)).shape == (2, 16, 16)
+    with pytest.raises(EncoderError, match=r"is a vit; expected dinov2, .*, or efficientnet_lite0"):
+        load_encoder(str(tmp_path))
 
 
 def test_unknown_encoder_is_a_clear_error(tmp_path):

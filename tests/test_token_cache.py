@@ -15,7 +15,7 @@ from lerobot_latentsafe.datasets import build_cache
 from lerobot_latentsafe.datasets.build_cache import build_frame_cache
 from lerobot_latentsafe.datasets.frame_cache import FrameCache, FrameCacheError
 from lerobot_latentsafe.encoders.patch_encoders import EncoderError
-from lerobot_latentsafe.encoders.perception import EncoderMismatchError, PatchBasis
+from lerobot_latentsafe.encoders.perception import EncoderMismatchError, PatchBasis, Perception
 from lerobot_latentsafe.pictures import to_model_images
 
 
@@ -189,10 +189,13 @@ def component_root(dataset, tmp_path_factory):
     return root
 
 
+def dino_wm_policy(root, **changes):
+    world_model = tiny.dino_wm_config(**{"frame_token": True, "merge_patches": 2, **changes})
+    return tiny.new_policy(tiny.metadata(root), world_model=world_model)
+
+
 def dino_wm_of(root, **changes):
-    perception = tiny.perception_config(**changes)
-    world_model = tiny.dino_wm_config(perception=perception, frame_token=True, merge_patches=2)
-    return tiny.new_policy(tiny.metadata(root), world_model=world_model).model.world_model
+    return dino_wm_policy(root, perception=tiny.perception_config(**changes)).model.world_model
 
 
 def test_cached_components_are_those_at_deployment(component_root, dataset):
@@ -215,6 +218,55 @@ def test_whole_tokens_are_cut_down_to_the_components_that_are_read(component_roo
     # What a latent stands for has the components that it tells of the whole frame.
     latent = model.correct(model.initial(3), cached, torch.zeros(3, 2))
     torch.testing.assert_close(model.basis(model.tokens_of(latent)), cached["vector"], rtol=1e-2, atol=1e-2)
+
+
+@pytest.mark.parametrize("kind", tiny.DINO)
+def test_a_frame_token_of_class_tokens_is_cached_trained_and_seen(kind, dataset, tmp_path):
+    encoder = tiny.save_dino(tmp_path / "dino", kind)
+    perception = tiny.perception_config(encoder=encoder, token_components=6)
+    cache = build_frame_cache(dataset, tmp_path / "tokens", None, tiny.tokens(config=perception), [0, 1])
+    assert cache.image_size == 224 and cache.manifest["percepts"] == ["tokens", "vector", "class"]
+    assert all(np.isfinite(values).all() for values in cache.percepts.values())
+    small = dict(image_size=224, frame_percept="class", perception=perception)
+    policy = dino_wm_policy(tmp_path / "tokens", **small)
+    loss, metrics = policy.forward({"index": torch.arange(4)})
+    assert loss.isfinite() and "loss_frame" in metrics
+    model, index = policy.model.world_model, np.array([0, 5, 11])
+    images = torch.stack([dataset[int(i)]["observation.image"] for i in index])
+    seen = model.perceive({"observation.image": to_model_images(images, 224)})
+    cached, _ = cache.frames(index, model.percept_names)
+    for name in ("tokens", "class"):
+        torch.testing.assert_close(cached[name], seen[name], rtol=5e-3, atol=5e-3)
+    latent = model.correct(model.initial(3), cached, torch.zeros(3, 2))
+    lifted = model.patches.lift(cached["tokens"])  # class tokens tell of no patch
+    torch.testing.assert_close(model.tokens_of(latent), lifted)
+    stored = {name for name in policy.state_dict() if "class_scale" in name or "basis" in name}
+    assert stored == {f"model.world_model.class_scale.{name}" for name in ("mean", "std", "fitted")}
+    with pytest.raises(ValueError, match="do not fill the grid"):
+        dino_wm_policy(tmp_path / "tokens", **small, merge_patches=3)
+
+
+def test_class_tokens_of_an_encoder_without_any_are_refused(component_root):
+    with pytest.raises(FrameCacheError, match=r"efficientnet_lite0 has no class token.*--encoder=dinov2"):
+        dino_wm_policy(component_root, frame_percept="class")
+    with pytest.raises(ValueError, match="efficientnet_lite0 has no class token"):
+        tiny.dino_wm_config(frame_token=True, frame_percept="class").build(["observation.image"], 2, 2)
+
+
+def test_a_basis_of_before_class_tokens_were_kept_is_refused(dataset, component_root, tmp_path):
+    old = shutil.copytree(component_root, tmp_path / "old")
+    tiny.rewrite_json(old / "frame_cache" / "manifest.json", percepts=["tokens"])
+    with pytest.raises(FrameCacheError, match=r"holds tokens, and this one is to hold tokens, vector.*build it anew"):
+        build_frame_cache(dataset, tmp_path / "new", tiny.TOKEN_SIZE, tiny.tokens(basis_from=old))
+
+
+def test_large_tokens_are_sampled_less(dataset, token_root, tmp_path, monkeypatch):
+    """At the paper's sizes a frame is 768 kB: what principal components are found in must fit in memory."""
+    sampled, fit = [], Perception.fit
+    monkeypatch.setattr(build_cache, "SAMPLED_BYTES", 100 * 4 * 448)
+    monkeypatch.setattr(Perception, "fit", lambda self, seen: sampled.append(len(seen.tokens)) or fit(self, seen))
+    build_frame_cache(dataset, tmp_path / "new", tiny.TOKEN_SIZE, tiny.tokens())
+    assert 100 <= sampled[0] < 100 + dataset.num_episodes
 
 
 def test_the_more_components_the_nearer_to_the_tokens(dataset, token_root, component_root):

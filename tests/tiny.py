@@ -58,6 +58,21 @@ def perception_config(**changes):
     return PerceptionConfig(**{"encoder": "efficientnet_lite0", "components": COMPONENTS, **changes})
 
 
+DINO = ("Dinov2Config", "Dinov2WithRegistersConfig", "DINOv3ViTConfig")
+"""Names in transformers of the kinds of DINO."""
+
+
+def save_dino(folder, kind=DINO[0]):
+    """A DINO of a few random weights, saved as on the Hub; the name to load it by."""
+    transformers = pytest.importorskip("transformers")
+    torch.manual_seed(0)
+    options = dict(hidden_size=32, num_hidden_layers=1, num_attention_heads=2, intermediate_size=64)
+    if kind != "Dinov2Config":
+        options["num_register_tokens"] = 4
+    transformers.AutoModel.from_config(getattr(transformers, kind)(**options)).save_pretrained(folder)
+    return str(folder)
+
+
 def gru_config(**changes):
     from lerobot_latentsafe.world_models import GRUConfig
 

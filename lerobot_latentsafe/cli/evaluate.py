@@ -306,6 +306,7 @@ class DrawFeatures:
     def run(self) -> None:
         """Draw and save."""
         encoder = load_encoder(self.encoder)
+        encoder.n_patches(self.image_size, self.image_size)
         seen = see_variants(self.image_size, self.behavior, self.step, self.seed)
         save(draw_features(encoder, seen), self.output)
         print(f"{encoder.name} on {len(seen)} variants in {self.output}")

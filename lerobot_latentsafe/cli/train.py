@@ -31,7 +31,7 @@ class Cache:
     """The folder to write."""
     dataset: DatasetSource = field(default_factory=DatasetSource)
     image_size: int | None = None
-    """Pixels; by default 32, or 96 with an encoder."""
+    """Pixels; by default 32, or with an encoder what that is usually given: 96 for efficientnet_lite0, 224 for DINO."""
     encoder: str | None = None
     """auto, dinov2, dinov2_registers, dinov3, efficientnet_lite0, a folder or a Hub id."""
     token_components: int | None = None
@@ -50,15 +50,16 @@ class Cache:
 
     def run(self) -> None:
         """Build the cache, or go on building it."""
-        size, recipe = 96 if self.encoder else 32, Pictures
-        size = size if self.image_size is None else self.image_size
+        recipe = Pictures
         if self.encoder:
             config = PerceptionConfig(encoder=self.encoder, token_components=self._token_components())
             recipe = partial(Tokens, config=config, dtype=self.dtype, basis_from=self.basis_from)
-        cache = build_frame_cache(self.dataset.opened(), self.output_dir, size, recipe, self.dataset.episodes)
+        cache = build_frame_cache(
+            self.dataset.opened(), self.output_dir, self.image_size, recipe, self.dataset.episodes
+        )
         if cache is None:
             return  # another process finishes
-        print(f"{cache.manifest['n_frames']} frames at {size} px in {self.output_dir}")
+        print(f"{cache.manifest['n_frames']} frames at {cache.image_size} px in {self.output_dir}")
         print(f"train with --dataset.repo_id={cache.manifest['repo_id']}_cache --dataset.root={self.output_dir}")
 
     def _token_components(self) -> int:

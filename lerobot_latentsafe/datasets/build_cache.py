@@ -40,6 +40,7 @@ from lerobot_latentsafe.datasets.frame_cache import (
 )
 from lerobot_latentsafe.datasets.label_places import sidecar_path, specifications_of
 from lerobot_latentsafe.datasets.labels import Content, Sidecar, all_labels
+from lerobot_latentsafe.encoders.patch_encoders import Seen, joined
 from lerobot_latentsafe.encoders.perception import Perception, PerceptionConfig
 from lerobot_latentsafe.pictures import to_model_images
 from lerobot_latentsafe.runtime.files import (
@@ -62,8 +63,10 @@ ENCODED_AT_ONCE = 8
 """Frames an encoder reads together: few enough for its activations to stay in a CPU's cache."""
 TOGETHER = 2**21
 """Numbers of pictures that are made small together."""
-SAMPLED_EPISODES, SAMPLED_FRAMES = 100, 4000
-"""From which principal components are found."""
+SAMPLED_EPISODES, SAMPLED_FRAMES, SAMPLED_BYTES = 100, 4000, 2**30
+"""From so many episodes, and at most so many frames and bytes of tokens, principal components are found."""
+PICTURE_SIZE = 32
+"""Side of pictures that are kept themselves, by default."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +110,8 @@ class Recipe(Protocol):
 class Pictures:
     """Each camera's picture, in 8 bits."""
 
-    def __init__(self, cameras: list[str], image_size: int):
+    def __init__(self, cameras: list[str], image_size: int | None):
+        image_size = PICTURE_SIZE if image_size is None else image_size
         self.arrays: dict[str, tuple[tuple[int, ...], str]] = {
             key: ((3, image_size, image_size), "uint8") for key in cameras
         }
@@ -125,30 +129,29 @@ class Pictures:
 
 
 class Tokens:
-    """A frozen encoder's tokens, whole or their principal components, and the principal components of a frame's.
+    """A frozen encoder's tokens, whole or their principal components, and what stands for a whole frame: the principal
+    components of all its tokens, and the class tokens of an encoder that has them.
 
     Args:
+        image_size: None: the encoder's default.
         dtype: of the tokens: float16, or int8 with a scale for each token.
         basis_from: a folder with a cache whose principal components to use, so that one world model reads both.
     """
 
     def __init__(
-        self, cameras: list[str], image_size: int, config: PerceptionConfig, dtype: str = "float16",
+        self, cameras: list[str], image_size: int | None, config: PerceptionConfig, dtype: str = "float16",
         basis_from: str | Path | None = None,
     ):  # fmt: skip
         if dtype not in TOKEN_TYPES:
             raise ValueError(f"--dtype is {dtype!r}; expected {' or '.join(TOKEN_TYPES)}")
         self.perception, self.dtype, self.basis_from = Perception(config, cameras, image_size), dtype, basis_from
-        n_patches = self.perception.n_patches
-        self.arrays = {
-            "tokens": ((n_patches, self.perception.token_dim), dtype),
-            "vector": ((config.components,), "float16"),
-        }
+        self.arrays = {name: (size, "float16") for name, size in self.perception.sizes.items()}
         if dtype == "int8":
-            self.arrays["tokens.scale"] = ((n_patches, 1), "float16")
+            n_patches, _ = shape = self.perception.sizes["tokens"]
+            self.arrays |= {"tokens": (shape, dtype), "tokens.scale": ((n_patches, 1), "float16")}
         self.manifest = {
-            "image_size": image_size,
-            "percepts": ["tokens", "vector"],
+            "image_size": self.perception.image_size,
+            "percepts": list(self.perception.sizes),
             "encoder": self.perception.config.encoder,
             "encoder_hash": self.perception.config.encoder_hash,
             "components": config.components,
@@ -175,16 +178,22 @@ class Tokens:
                     f"--token_components is {n}, and the cache in {self.basis_from} keeps {n_other}; give the same, or "
                     "0 for whole tokens"
                 )
+            if other.manifest["percepts"] != self.manifest["percepts"]:
+                raise FrameCacheError(
+                    f"the cache in {self.basis_from} holds {', '.join(other.manifest['percepts'])}, and this one is to "
+                    f"hold {', '.join(self.manifest['percepts'])}; an older version made it, build it anew"
+                )
             shutil.copyfile(basis_file(self.basis_from), folder / BASIS)
             return
         rng = np.random.default_rng(0)
         episodes = rng.permutation(n_episodes)[:SAMPLED_EPISODES]
-        tokens = []
+        n_frames = min(SAMPLED_FRAMES, SAMPLED_BYTES // (4 * self.perception.basis.mean.numel()))
+        sample = []
         for episode in episodes:
-            picked = rng.permutation(see.length(episode))[: -(-SAMPLED_FRAMES // len(episodes))]
-            tokens += [self._tokens(images) for images in see.pieces(episode, np.sort(picked).tolist())]
+            picked = rng.permutation(see.length(episode))[: -(-n_frames // len(episodes))]
+            sample += [self._seen(images) for images in see.pieces(episode, np.sort(picked).tolist())]
         torch.manual_seed(0)
-        self.perception.fit(torch.cat(tokens))
+        self.perception.fit(joined(sample))
         save_file(self.perception.components(), folder / BASIS)
 
     def start(self, folder: Path) -> None:
@@ -194,18 +203,17 @@ class Tokens:
 
     def perceive(self, images: dict[str, Tensor]) -> dict[str, np.ndarray]:
         """Numbers of some frames: name -> (T, ...)."""
-        seen = self.perception.kept(self._tokens(images))
-        tokens, vector = seen["tokens"], seen["vector"].half().numpy()
-        if self.dtype == "float16":
-            return {"tokens": tokens.half().numpy(), "vector": vector}
-        rounded, scale = eight_bits(tokens)
-        return {"tokens": rounded.numpy(), "tokens.scale": scale.numpy(), "vector": vector}
+        kept = self.perception.kept(self._seen(images))
+        numbers = {name: value.half() for name, value in kept.items()}
+        if self.dtype == "int8":
+            numbers["tokens"], numbers["tokens.scale"] = eight_bits(kept["tokens"])
+        return {name: value.numpy() for name, value in numbers.items()}
 
-    def _tokens(self, images: dict[str, Tensor]) -> Tensor:
+    def _seen(self, images: dict[str, Tensor]) -> Seen:
         n = len(next(iter(images.values())))
         parts = range(0, n, ENCODED_AT_ONCE)
-        return torch.cat(
-            [self.perception.tokens({k: v[at : at + ENCODED_AT_ONCE] for k, v in images.items()}) for at in parts]
+        return joined(
+            [self.perception.see({k: v[at : at + ENCODED_AT_ONCE] for k, v in images.items()}) for at in parts]
         )
 
 
@@ -216,12 +224,13 @@ def eight_bits(tokens: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def build_frame_cache(
-    dataset: LeRobotDataset, output_dir: str | Path, image_size: int,
-    recipe: Callable[[list[str], int], Recipe] = Pictures, episodes: list[int] | None = None,
+    dataset: LeRobotDataset, output_dir: str | Path, image_size: int | None,
+    recipe: Callable[[list[str], int | None], Recipe] = Pictures, episodes: list[int] | None = None,
 ) -> FrameCache | None:  # fmt: skip
     """Make a cache, or go on making it.
 
     Args:
+        image_size: None: the recipe's default.
         recipe: from cameras and image size: `Pictures`, or `Tokens` with its encoder.
         episodes: those to keep, which are numbered anew from 0; None: all.
 
@@ -247,8 +256,8 @@ def build_frame_cache(
         contract = _contract_with_cameras(dataset)
         frames = DatasetFrames(dataset.meta, episodes)
         frames.cameras = list(contract.cameras)
-        see = Sight(frames, image_size)
         kept = recipe(frames.cameras, image_size)
+        see = Sight(frames, kept.manifest["image_size"])
         keep_freed_memory()
         if _rank() == 0 and not unfinished:
             _lay_out(dataset, contract, frames.episodes, output_dir, kept, see)

@@ -107,7 +107,7 @@ class FrameCache:
         if self.image_size != size:
             raise FrameCacheError(
                 f"this cache holds {self.image_size}-pixel frames, the world model reads {size}; build it with "
-                f"latentsafe cache --image_size={size}"
+                f"latentsafe cache --image_size={size}, or train with --policy.world_model.image_size={self.image_size}"
             )
 
     def frames(self, index: np.ndarray, names: list[str] | None = None) -> tuple[dict[str, Tensor], Tensor]:

@@ -1,4 +1,4 @@
-"""Frozen, pretrained patch encoders: images to a grid of tokens.
+"""Frozen, pretrained patch encoders: images to a grid of tokens, and to a class token if the encoder has one.
 
 `auto` takes DINOv2 if it is in the Hub's cache or a Hub answers, else the ImageNet-pretrained trunk of
 EfficientNet-Lite0 that comes as a package, and says so. Random weights are never an option: features that mean nothing
@@ -8,8 +8,8 @@ with whatever was made from its tokens.
 
 import hashlib
 import logging
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -25,24 +25,50 @@ DINO = {
 }
 """Short names of encoders on the Hub."""
 BUNDLED = "efficientnet_lite0"
+KINDS = ("dinov2", "dinov2_with_registers", "dinov3_vit")
+"""Models of transformers whose tokens are known to be a class token, registers, and a patch each, in this order."""
+PAPER_SIZE = 224
+"""Pixels a side at which the paper shows pictures to DINOv2."""
 
 
 class EncoderError(RuntimeError):
     """An encoder that cannot be had, or is not the one that was trained with."""
 
 
+class Seen(NamedTuple):
+    """What an encoder says of images.
+
+    Attributes:
+        tokens: (B, P, dim), one a patch.
+        class_token: (B, dim), of the whole image; None from an encoder that has none.
+    """
+
+    tokens: Tensor
+    class_token: Tensor | None
+
+
+def joined(parts: Sequence[Seen]) -> Seen:
+    """What was said of some images after the other, of all of them."""
+    tokens, class_tokens = zip(*parts)
+    return Seen(torch.cat(tokens), None if any(c is None for c in class_tokens) else torch.cat(class_tokens))
+
+
 class PatchEncoder(nn.Module):
-    """Images (B, 3, S, S) in [0, 1] -> tokens (B, P, dim). Never trained.
+    """Images (B, 3, S, S) in [0, 1] -> what it says of them. Never trained.
 
     Attributes:
         name: what to ask `load_encoder` for to get the same one.
         dim: numbers a token.
         patch: side of the square of pixels that a token stands for.
+        image_size: side of the images that it is given by default.
+        has_class_token: whether it says something of whole images.
     """
 
     name: str
     dim: int
     patch: int
+    image_size: int
+    has_class_token: bool
     mean: Tensor
     std: Tensor
 
@@ -51,20 +77,29 @@ class PatchEncoder(nn.Module):
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN)[:, None, None], persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD)[:, None, None], persistent=False)
 
-    def tokens(self, images: Tensor) -> Tensor:
-        """Tokens of normalised images."""
+    def see(self, images: Tensor) -> Seen:
+        """What it says of normalised images."""
         raise NotImplementedError
 
-    @torch.no_grad()
-    def forward(self, images: Tensor) -> Tensor:
-        """Images (B, 3, S, S) in [0, 1] -> tokens (B, P, dim)."""
-        size = images.shape[-1]
-        if images.shape[-2] != size or size % self.patch:
+    def n_patches(self, height: int, width: int) -> int:
+        """Patches of an image of so many pixels.
+
+        Raises:
+            ValueError: it is no square, or no whole number of patches.
+        """
+        if height != width or height % self.patch or not height:
+            near = max(1, round(height / self.patch)) * self.patch
             raise ValueError(
-                f"{self.name} reads square images of a multiple of {self.patch} pixels, got "
-                f"{tuple(images.shape[-2:])}; choose another image_size"
+                f"{self.name} reads square images of a multiple of {self.patch} pixels, got {(height, width)}; choose "
+                f"another image_size, such as {near}"
             )
-        return self.tokens((images - self.mean) / self.std)
+        return (height // self.patch) ** 2
+
+    @torch.no_grad()
+    def forward(self, images: Tensor) -> Seen:
+        """What it says of images (B, 3, S, S) in [0, 1]."""
+        self.n_patches(*images.shape[-2:])
+        return self.see((images - self.mean) / self.std)
 
     def weights_hash(self) -> str:
         """Identifies the weights: the first 16 digits of a SHA-256 over all of them."""
@@ -84,18 +119,29 @@ def _hash(weights: dict[str, Tensor]) -> str:
 
 
 class DinoEncoder(PatchEncoder):
-    """DINOv2, with or without registers, or DINOv3, by `transformers`."""
+    """DINOv2, with or without registers, or DINOv3, by `transformers`.
+
+    Raises:
+        EncoderError: the model is another.
+    """
+
+    has_class_token = True
 
     def __init__(self, name: str, model: Any):
         super().__init__()
-        self.name, self.model = name, model
+        kind = getattr(model.config, "model_type", None)
+        if kind not in KINDS:
+            raise EncoderError(f"encoder {name} is a {kind}; expected {', '.join(KINDS)}, or {BUNDLED}")
+        self.name, self.model = name, model.float()
         self.dim, self.patch = model.config.hidden_size, model.config.patch_size
+        self.image_size = max(1, PAPER_SIZE // self.patch) * self.patch
         # The class token and the registers come first and stand for no patch.
         self.n_skipped = 1 + getattr(model.config, "num_register_tokens", 0)
 
-    def tokens(self, images: Tensor) -> Tensor:
-        """Tokens of normalised images (B, 3, S, S): (B, P, dim)."""
-        return self.model(pixel_values=images).last_hidden_state[:, self.n_skipped :]
+    def see(self, images: Tensor) -> Seen:
+        """What it says of normalised images (B, 3, S, S)."""
+        tokens = self.model(pixel_values=images).last_hidden_state
+        return Seen(tokens[:, self.n_skipped :], tokens[:, 0])
 
 
 class _Conv(nn.Module):
@@ -115,7 +161,7 @@ class _Conv(nn.Module):
         self.groups = len(weight) if weight.shape[1] == 1 else 1
 
     def forward(self, x: Tensor) -> Tensor:
-        """Images (B, 3, S, S) in [0, 1] -> tokens (B, P, dim)."""
+        """(B, C, S, S) -> (B, C', S', S')."""
         kernel = self.weight.shape[-1]
         missing = max((-(-x.shape[-1] // self.stride) - 1) * self.stride + kernel - x.shape[-1], 0)
         before, after = missing // 2, missing - missing // 2
@@ -139,7 +185,7 @@ class _Block(nn.Module):
         self.layers = nn.Sequential(*layers)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Images (B, 3, S, S) in [0, 1] -> tokens (B, P, dim)."""
+        """(B, C, S, S) -> (B, C', S', S')."""
         y = self.layers(x)
         return x + y if x.shape == y.shape else y
 
@@ -147,7 +193,7 @@ class _Block(nn.Module):
 class EfficientNetLite0(PatchEncoder):
     """The trunk of EfficientNet-Lite0 up to its stride of 16: 112 channels, ImageNet weights (Apache-2.0)."""
 
-    name, dim, patch = BUNDLED, 112, 16
+    name, dim, patch, image_size, has_class_token = BUNDLED, 112, 16, 96, False
     strides = (1, 2, 1, 2, 1, 2, 1, 1, 1, 1, 1)
 
     def __init__(self, weights: dict[str, Tensor]):
@@ -160,10 +206,10 @@ class EfficientNetLite0(PatchEncoder):
         """Of the weights as they were published: once folded they differ among processors in the last bit."""
         return self._weights_hash
 
-    def tokens(self, images: Tensor) -> Tensor:
-        """Tokens of normalised images (B, 3, S, S): (B, P, dim)."""
+    def see(self, images: Tensor) -> Seen:
+        """What it says of normalised images (B, 3, S, S)."""
         grid = self.net(images.contiguous(memory_format=torch.channels_last))
-        return grid.flatten(2).transpose(1, 2)
+        return Seen(grid.flatten(2).transpose(1, 2), None)
 
 
 def load_bundled() -> EfficientNetLite0:

@@ -1,5 +1,6 @@
-"""What a token world model sees of a frame: a frozen encoder's tokens, or their principal components."""
+"""What a token world model sees of a frame: a frozen encoder's tokens, their principal components, class tokens."""
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
@@ -8,7 +9,7 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from lerobot_latentsafe.encoders.patch_encoders import PatchEncoder, load_encoder
+from lerobot_latentsafe.encoders.patch_encoders import PatchEncoder, Seen, load_encoder
 
 LIVE = 64
 """So many pictures at most are of robots that act now, and are remembered until the next ones."""
@@ -153,6 +154,34 @@ class PatchBasis(nn.Module):
         self.fitted.fill_(True)
 
 
+class ClassScale(nn.Module):
+    """The cameras' class tokens side by side (..., cameras x C): each number of mean 0, each camera's of variance 1."""
+
+    mean: Tensor
+    std: Tensor
+    fitted: Tensor
+
+    def __init__(self, n_cameras: int, token_dim: int):
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(n_cameras, token_dim))
+        self.register_buffer("std", torch.ones(n_cameras, 1))
+        self.register_buffer("fitted", torch.zeros((), dtype=torch.bool))
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Class tokens on that scale."""
+        _require_fitted(self.fitted)
+        return ((tokens.unflatten(-1, self.mean.shape) - self.mean) / self.std).flatten(-2)
+
+    @torch.no_grad()
+    def fit(self, tokens: Tensor) -> None:
+        """From a sample of frames' class tokens (N, cameras x C)."""
+        apart = tokens.float().unflatten(-1, self.mean.shape)
+        self.mean.copy_(apart.mean(0))
+        variance = (apart - self.mean).square().mean((0, 2))
+        self.std.copy_(variance.sqrt().clamp(min=1e-6)[:, None])
+        self.fitted.fill_(True)
+
+
 def _require_fitted(fitted: Tensor) -> None:
     if not fitted:
         raise RuntimeError(
@@ -162,58 +191,98 @@ def _require_fitted(fitted: Tensor) -> None:
 
 
 class Perception(nn.Module):
-    """Images -> {"tokens": (B, P, token_dim), "vector": (B, components)}; `config` names the encoder found.
+    """Images -> what is kept of them, by name; `config` names the encoder found. That is
 
-    Tokens are whole, a patch of each camera side by side, or each camera's `token_components`.
+        tokens (B, P, token_dim)      whole, a patch of each camera side by side, or each camera's `token_components`
+        vector (B, components)        principal components of the whole frame
+        class (B, cameras x dim)      the cameras' class tokens side by side, on one scale, of an encoder that has them
 
     The encoder's weights are not part of a checkpoint; its name and hash in the configuration are.
+
+    Args:
+        image_size: None: the encoder's default.
+
+    Raises:
+        EncoderError: the encoder cannot be had, or is another.
+        ValueError: its patches do not fill images of this size.
     """
 
-    _latest: ClassVar[dict[tuple, tuple[Tensor, Tensor]]] = {}
-    """Pictures encoded last and their tokens: a policy and the filter that shields it look at the same ones."""
+    _latest: ClassVar[dict[tuple, tuple[Tensor, Seen]]] = {}
+    """Pictures encoded last, and what was seen: a policy and the filter that shields it look at the same ones."""
 
-    def __init__(self, config: PerceptionConfig, image_keys: list[str], image_size: int):
+    def __init__(self, config: PerceptionConfig, image_keys: list[str], image_size: int | None):
         super().__init__()
-        self.image_keys, self.image_size = sorted(image_keys), image_size
         encoder = load_encoder(config.encoder, config.encoder_hash)
+        self.image_keys, self.image_size = sorted(image_keys), encoder.image_size if image_size is None else image_size
         self.config = replace(config, encoder=encoder.name, encoder_hash=encoder.weights_hash())
         self.encoder_hash = self.config.encoder_hash
         self._encoder = [encoder]  # in a list, so that its weights are not ours
-        self.n_patches, n_cameras = (image_size // encoder.patch) ** 2, len(self.image_keys)
+        self.n_patches, n_cameras = encoder.n_patches(self.image_size, self.image_size), len(self.image_keys)
         self.basis = FrameBasis(self.n_patches * encoder.dim * n_cameras, config.components)
         n_kept = config.token_components or 0
         self.patches = PatchBasis(n_cameras, encoder.dim, n_kept) if n_kept else None
+        # In a list, so that it is part of the world models that read class tokens, and of no others.
+        self._class_scale = [ClassScale(n_cameras, encoder.dim) if encoder.has_class_token else None]
         self.token_dim = n_cameras * (n_kept or encoder.dim)
+        self.sizes: dict[str, tuple[int, ...]] = {
+            "tokens": (self.n_patches, self.token_dim),
+            "vector": (config.components,),
+        }
+        if self.class_scale is not None:
+            self.sizes["class"] = (n_cameras * encoder.dim,)
 
     @property
     def encoder(self) -> PatchEncoder:
         """The frozen encoder."""
         return self._encoder[0]
 
-    def tokens(self, images: dict[str, Tensor]) -> Tensor:
-        """Camera key -> (B, 3, S, S) in [0, 1] to whole tokens (B, P, n_cameras x dim)."""
+    @property
+    def class_scale(self) -> ClassScale | None:
+        """The scale of class tokens; None if the encoder has none."""
+        return self._class_scale[0]
+
+    def see(self, images: dict[str, Tensor]) -> Seen:
+        """Camera key -> (B, 3, S, S) in [0, 1] to what the encoder says of them, the cameras' tokens side by side.
+
+        Returns:
+            Whole tokens (B, P, n_cameras x dim) and, if there are any, class tokens (B, n_cameras x dim).
+        """
         together = torch.cat([images[key] for key in self.image_keys])
         key = self.encoder_hash, len(self.image_keys), together.device
-        known, tokens = self._latest.get(key, (None, None))
-        if known is not None and torch.equal(known, together):
-            return tokens
+        if key in self._latest:
+            known, seen = self._latest[key]
+            if torch.equal(known, together):
+                return seen
         if self.encoder.mean.device != together.device:  # asking all of its modules at each tick takes milliseconds
             self.encoder.to(together.device)
-        tokens = torch.cat(self.encoder(together).float().chunk(len(self.image_keys)), -1)
+        seen = Seen(*(None if part is None else self._side_by_side(part) for part in self.encoder(together)))
         if len(together) <= LIVE:
-            self._latest[key] = together, tokens
-        return tokens
+            self._latest[key] = together, seen
+        return seen
 
-    def fit(self, tokens: Tensor) -> None:
-        """Principal components of a sample of whole tokens (N, P, n_cameras x dim)."""
-        self.basis.fit(tokens)
+    def _side_by_side(self, tokens: Tensor) -> Tensor:
+        """Tokens (n_cameras x B, ..., dim), camera by camera, as (B, ..., n_cameras x dim)."""
+        return torch.cat(tokens.float().chunk(len(self.image_keys)), -1)
+
+    def tokens(self, images: dict[str, Tensor]) -> Tensor:
+        """Camera key -> (B, 3, S, S) in [0, 1] to whole tokens (B, P, n_cameras x dim)."""
+        return self.see(images).tokens
+
+    def fit(self, seen: Seen) -> None:
+        """Principal components, and the scale of class tokens, of a sample of frames (N, ...)."""
+        self.basis.fit(seen.tokens)
         if self.patches is not None:
-            self.patches.fit(tokens)
+            self.patches.fit(seen.tokens)
+        if self.class_scale is not None and seen.class_token is not None:
+            self.class_scale.fit(seen.class_token)
 
     def components(self) -> dict[str, Tensor]:
-        """All principal components, as `load_basis` reads them from a file."""
-        kept = {} if self.patches is None else {f"patches.{key}": t for key, t in self.patches.state_dict().items()}
-        return {**self.basis.state_dict(), **kept}
+        """All that `fit` has found, as `load_basis` reads it from a file."""
+        found = self.basis.state_dict()
+        for name, part in (("patches", self.patches), ("class", self.class_scale)):
+            if part is not None:
+                found |= {f"{name}.{key}": tensor for key, tensor in part.state_dict().items()}
+        return found
 
     @classmethod
     def forget(cls) -> None:
@@ -221,7 +290,7 @@ class Perception(nn.Module):
         cls._latest.clear()
 
     def load_basis(self, file: Path) -> None:
-        """Principal components from a file of a token cache."""
+        """What `fit` has found, from a file of a token cache."""
         found = load_file(file)
         if found["axes"].shape != self.basis.axes.shape:
             (there, n_there), (here, n_here) = found["axes"].shape, self.basis.axes.shape
@@ -230,6 +299,8 @@ class Perception(nn.Module):
                 "cache at this image size and with as many, or set world_model.perception.components"
             )
         self.basis.load_state_dict({key: found[key] for key in self.basis.state_dict()})
+        if self.class_scale is not None and "class.mean" in found:  # older versions kept no class tokens
+            self.class_scale.load_state_dict({key: found[f"class.{key}"] for key in self.class_scale.state_dict()})
         if self.patches is None:
             return
         axes = found.get("patches.axes")
@@ -241,13 +312,20 @@ class Perception(nn.Module):
             )
         self.patches.load_state_dict({key: found[f"patches.{key}"] for key in self.patches.state_dict()})
 
-    def forward(self, images: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Camera key -> (B, 3, S, S) in [0, 1] to what is kept of the frames' tokens."""
-        return self.kept(self.tokens(images))
+    def forward(self, images: dict[str, Tensor], names: Collection[str] | None = None) -> dict[str, Tensor]:
+        """Camera key -> (B, 3, S, S) in [0, 1] to what is kept of the frames, or to what of that is named."""
+        return self.kept(self.see(images), names)
 
-    def kept(self, tokens: Tensor) -> dict[str, Tensor]:
-        """Whole tokens (B, P, n_cameras x dim) -> what is kept of them, by name."""
-        return {"tokens": self.cut_down(tokens), "vector": self.basis(tokens)}
+    def kept(self, seen: Seen, names: Collection[str] | None = None) -> dict[str, Tensor]:
+        """What is kept of frames that the encoder saw, or what of that is named."""
+        names, kept = self.sizes if names is None else names, {}
+        if "tokens" in names:
+            kept["tokens"] = self.cut_down(seen.tokens)
+        if "vector" in names:
+            kept["vector"] = self.basis(seen.tokens)
+        if "class" in names and self.class_scale is not None and seen.class_token is not None:
+            kept["class"] = self.class_scale(seen.class_token)
+        return kept
 
     def cut_down(self, tokens: Tensor) -> Tensor:
         """Tokens (..., P, C), whole or cut down already, as they are kept."""

@@ -74,8 +74,9 @@ class TokenSpace:
                 "one with latentsafe cache --encoder=auto"
             )
         self.root, self.cameras, self.fps = Path(meta.root), sorted(manifest["cameras"]), meta.fps
-        self.basis = FrameBasis(*load_file(basis_file(meta.root))["axes"].shape)
-        self.basis.load_state_dict(load_file(basis_file(meta.root)))
+        found = load_file(basis_file(meta.root))
+        self.basis = FrameBasis(*found["axes"].shape)
+        self.basis.load_state_dict({key: found[key] for key in self.basis.state_dict()})
 
     def recorded(self, index: np.ndarray) -> Tensor:
         """Tokens (N, P, C) of frames (N,)."""

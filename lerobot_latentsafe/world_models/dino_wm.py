@@ -12,7 +12,8 @@ next hardly anything changes, and texture that nothing can predict drowns what t
 * the rest of each clip is imagined from its start (open loop);
 * a step of the model is several ticks of the robot (`frame_skip`);
 * tokens are principal components of what the encoder says, four patches side by side (`merge_patches`);
-* a frame token carries the components of the whole frame, as a class token would, and most of the loss weighs on it.
+* a frame token carries the components of the whole frame, or the encoder's class tokens, and most of the loss weighs on
+  it.
 """
 
 import math
@@ -25,7 +26,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from lerobot_latentsafe.datasets.clips import Clip
-from lerobot_latentsafe.datasets.frame_cache import basis_file
+from lerobot_latentsafe.datasets.frame_cache import FrameCacheError, basis_file
 from lerobot_latentsafe.encoders.perception import Perception, PerceptionConfig
 from lerobot_latentsafe.latent import Latent
 from lerobot_latentsafe.runtime.distributed import from_first_rank, mean_over_ranks
@@ -35,6 +36,8 @@ from lerobot_latentsafe.world_models.patch_summary import PatchSummary
 from lerobot_latentsafe.world_models.termination import TerminationHead
 
 CONDITIONINGS = ("adaln", "concat")
+FRAME_PERCEPTS = {"components": "vector", "class": "class"}
+"""What a frame token may carry -> the percept that holds it."""
 MOST_WEIGHT = 5.0
 """The error of a token that changes weighs at most so many times the average."""
 
@@ -58,7 +61,9 @@ class DinoWMConfig(WorldModelConfig):
         open_loop: weight of the error of what is imagined open loop; 0 is teacher forcing alone, as in the paper.
         change_weight: share of a token error's weight that follows how much the token changes.
         merge_patches: so many patches a side, side by side, are one token.
-        frame_token: whether a token beside the patches carries the principal components of the whole frame.
+        frame_token: whether a token beside the patches stands for the whole frame.
+        frame_percept: what it carries: the frame's principal components (`components`), or the class token of each
+            camera (`class`), of an encoder that has them: DINOv2 and DINOv3 do, efficientnet_lite0 does not.
         token_weight, frame_weight: of the errors of patches, and of the frame token.
         blind: see no images, only proprioception: the control that a model which looks must beat.
     """
@@ -82,6 +87,7 @@ class DinoWMConfig(WorldModelConfig):
     change_weight: float = 0.0
     merge_patches: int = 2
     frame_token: bool = True
+    frame_percept: str = "components"
     token_weight: float = 0.1
     frame_weight: float = 1.0
     blind: bool = False
@@ -90,8 +96,15 @@ class DinoWMConfig(WorldModelConfig):
         super().__post_init__()
         if self.conditioning not in CONDITIONINGS:
             raise ValueError(f"conditioning is {self.conditioning!r}; expected one of {', '.join(CONDITIONINGS)}")
-        if self.clip_length < 2:
-            raise ValueError(f"clip_length is {self.clip_length}; a prediction needs at least 2 frames")
+        if self.frame_percept not in FRAME_PERCEPTS:
+            raise ValueError(f"frame_percept is {self.frame_percept!r}; expected one of {', '.join(FRAME_PERCEPTS)}")
+        if self.history < 1:
+            raise ValueError(f"history is {self.history}; a prediction is made from at least 1 frame")
+        if self.clip_length <= self.history:
+            raise ValueError(
+                f"clip_length is {self.clip_length}; a prediction from history={self.history} frames needs at least "
+                f"{self.history + 1}"
+            )
         if self.head_dim % 2:
             raise ValueError(f"head_dim is {self.head_dim}; the rotary embedding turns pairs, give an even number")
         if self.conditioning == "concat" and self.dim <= 2 * self.embedding:
@@ -101,15 +114,34 @@ class DinoWMConfig(WorldModelConfig):
 
     def of_cache(self, manifest: dict) -> "DinoWMConfig":
         """With the encoder of a token cache; see the base class."""
-        return replace(self, perception=self.perception.of_cache(manifest))
+        config = replace(self, perception=self.perception.of_cache(manifest))
+        if self.reads_class_tokens and "class" not in manifest["percepts"]:
+            raise FrameCacheError(_no_class_token(manifest["encoder"]))
+        return config
+
+    @property
+    def reads_class_tokens(self) -> bool:
+        """Whether the frame token carries what the encoder says of the whole frame."""
+        return self.frame_token and self.frame_percept == "class"
 
     def build(self, image_keys: list[str], state_dim: int, action_dim: int) -> "DinoWM":
         """A DINO-WM with fresh weights."""
         if not image_keys:
             raise ValueError("a DINO-WM needs at least one camera, got none; record observation.image* features")
         perception = Perception(self.perception, image_keys, self.image_size)
-        sizes = (perception.n_patches, perception.token_dim)
+        if self.reads_class_tokens and perception.class_scale is None:
+            raise ValueError(_no_class_token(perception.config.encoder))
+        n_frame = perception.sizes[FRAME_PERCEPTS[self.frame_percept]][0]
+        sizes = (perception.n_patches, perception.token_dim, n_frame)
         return DinoWM(self, image_keys, state_dim, action_dim, *sizes, perception)
+
+
+def _no_class_token(encoder: str) -> str:
+    return (
+        f"world_model.frame_percept is class, and {encoder} has no class token, or its cache was made before they were "
+        "kept; build the cache with an encoder that has one (latentsafe cache --encoder=dinov2), or set "
+        "world_model.frame_percept=components"
+    )
 
 
 class _Ahead(NamedTuple):
@@ -137,7 +169,7 @@ class DinoWM(TerminationHead):
     """See the module's text. A latent holds
 
         tokens (B, P, C), state (B, S)    of the frame, seen or imagined
-        vector (B, F)                     components of the whole frame, with a frame token; P counts it for past_i
+        vector (B, F)                     of the whole frame, with a frame token; P counts it for past_i
         context (B, d)                    what the frames before said of it: the transformer's output, mean over patches
         seen (B,)                         frames known, this one included, at most H; 0 before the first
         past_i (B, H - 1, P, 2 K)         keys and values of the frames before in layer i
@@ -145,6 +177,7 @@ class DinoWM(TerminationHead):
 
     Args:
         n_patches, token_dim: of the percepts, before patches are merged to P tokens of C numbers.
+        n_frame: F, numbers that a frame token carries; by default all components.
         perception: what makes tokens of images; without it the model reads tokens only.
     """
 
@@ -152,18 +185,21 @@ class DinoWM(TerminationHead):
 
     def __init__(
         self, config: DinoWMConfig, image_keys: list[str], state_dim: int, action_dim: int, n_patches: int,
-        token_dim: int, perception: Perception | None = None,
+        token_dim: int, n_frame: int | None = None, perception: Perception | None = None,
     ):  # fmt: skip
         super().__init__()
         self.config = config if perception is None else replace(config, perception=perception.config)
         self.image_keys, self.action_dim = sorted(image_keys), action_dim
         self._perception = [perception]  # in a list, so that the encoder is not part of the checkpoint
         self.patches = None if perception is None else perception.patches
-        self.basis = None if perception is None or not config.frame_token else perception.basis
+        reads = None if perception is None else self._frame_percept
+        self.basis = perception.basis if reads == "vector" else None
+        self.class_scale = perception.class_scale if reads == "class" else None
         self._grid = (*_merged_grid(n_patches, config.merge_patches), config.merge_patches)
         n_tokens, token_dim = self._grid[0] * self._grid[1], token_dim * config.merge_patches**2
         d, width = config.dim, config.summary
-        self._build_inputs(n_tokens, token_dim, state_dim)
+        n_frame = n_frame or config.perception.components
+        self._build_inputs(n_tokens, token_dim, n_frame, state_dim)
         condition_dim = d if config.conditioning == "adaln" else None
         self.transformer = FrameTransformer(
             d, config.depth, config.heads, config.head_dim, config.mlp, config.history, condition_dim
@@ -177,14 +213,13 @@ class DinoWM(TerminationHead):
         self.feature_dim = 2 * width + d + state_dim
         self.sizes = {"tokens": (n_tokens, token_dim), "state": (state_dim,), "context": (d,), "action": (action_dim,)}
         if config.frame_token:
-            n_components = config.perception.components
-            self.frame_decoder = _change_decoder(d, 2, n_components)
-            self.sizes["vector"] = (n_components,)
-            self.feature_dim += n_components
+            self.frame_decoder = _change_decoder(d, 2, n_frame)
+            self.sizes["vector"] = (n_frame,)
+            self.feature_dim += n_frame
         self.seen_names: list[str] = [name for name in ("tokens", "vector", "state") if name in self.sizes]
         self.continues = nn.Sequential(nn.Linear(self.feature_dim, 64), nn.SiLU(), nn.Linear(64, 1))
 
-    def _build_inputs(self, n_tokens: int, token_dim: int, state_dim: int) -> None:
+    def _build_inputs(self, n_tokens: int, token_dim: int, n_frame: int, state_dim: int) -> None:
         config, d = self.config, self.config.dim
         width = d
         if config.conditioning == "adaln":
@@ -197,7 +232,7 @@ class DinoWM(TerminationHead):
             width = d - 2 * config.embedding
         self.token_in = nn.Identity() if width == token_dim else nn.Linear(token_dim, width)
         if config.frame_token:
-            self.frame_in = nn.Linear(config.perception.components, width)
+            self.frame_in = nn.Linear(n_frame, width)
         # As large as the tokens: while patches are hard to tell apart, what an action moves is not learned.
         self.position = nn.Parameter(torch.randn(n_tokens + config.frame_token, d))
 
@@ -205,24 +240,25 @@ class DinoWM(TerminationHead):
 
     @property
     def percept_names(self) -> list[str]:
-        """Tokens of the frame, and its components if a token carries them."""
-        return ["tokens", "vector"] if self.config.frame_token else ["tokens"]
+        """Tokens of the frame, and what of the whole of it a frame token carries."""
+        return ["tokens", self._frame_percept] if self._frame_percept else ["tokens"]
+
+    @property
+    def _frame_percept(self) -> str | None:
+        return FRAME_PERCEPTS[self.config.frame_percept] if self.config.frame_token else None
 
     def load_basis(self, root: Path) -> None:
-        """Principal components from a dataset's token cache."""
+        """Principal components, or the scale of class tokens, from a dataset's token cache."""
         perception = self._perception[0]
-        if perception is not None and (self.basis is not None or self.patches is not None):
+        if perception is not None and any(part is not None for part in (self.basis, self.patches, self.class_scale)):
             perception.load_basis(basis_file(root))
 
     def perceive(self, images: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Camera key -> (B, 3, S, S) to tokens (B, patches, ...), and vector (B, F) with a frame token."""
+        """Camera key -> (B, 3, S, S) to tokens (B, patches, ...), and with a frame token what it carries (B, F)."""
         perception = self._perception[0]
         if perception is None:
             raise RuntimeError("this DINO-WM was made for tokens; build it from its configuration to let it see images")
-        if self.basis is None and self.patches is None:
-            return {"tokens": perception.tokens(images)}
-        seen = perception(images)
-        return {name: seen[name] for name in self.percept_names}
+        return perception(images, self.percept_names)
 
     def initial(self, batch_size: int) -> Latent:
         """Nothing seen, no frames remembered: (B, ...)."""
@@ -243,7 +279,7 @@ class DinoWM(TerminationHead):
         return {**predicted, **self._looked_at(percepts), "state": state}
 
     def features(self, latent: Latent) -> Tensor:
-        """Summary of the tokens, context, state and the frame's components side by side: (..., D)."""
+        """Summary of the tokens, context, state and what the frame token carries side by side: (..., D)."""
         frame = [latent["vector"]] if self.config.frame_token else []
         return torch.cat([self.summary(latent["tokens"]), latent["context"], latent["state"], *frame], -1)
 
@@ -274,9 +310,10 @@ class DinoWM(TerminationHead):
         return (latent["tokens"] - self._merged(percepts["tokens"])).square().mean((-2, -1))
 
     def _looked_at(self, percepts: dict[str, Tensor]) -> dict[str, Tensor]:
-        """What is seen of frames (..., P, C) and (..., F)."""
-        seen = {name: percepts[name] for name in self.percept_names}
-        seen["tokens"] = self._merged(seen["tokens"])
+        """What is seen of frames: tokens (..., P, C), and vector (..., F) with a frame token."""
+        seen = {"tokens": self._merged(percepts["tokens"])}
+        if self._frame_percept:
+            seen["vector"] = percepts[self._frame_percept]
         return {name: torch.zeros_like(value) for name, value in seen.items()} if self.config.blind else seen
 
     def _merged(self, tokens: Tensor) -> Tensor:

@@ -96,8 +96,7 @@ class FrameGRU(WorldModel):
 
     def perceive(self, images: dict[str, Tensor]) -> dict[str, Tensor]:
         """Camera key -> (B, 3, S, S) to vector (B, C), and tokens (B, P, D) with a summary."""
-        seen = self.perception(images)
-        return {name: seen[name] for name in self.percept_names}
+        return self.perception(images, self.percept_names)
 
     def initial(self, batch_size: int) -> Latent:
         """Zeros: (B, ...)."""

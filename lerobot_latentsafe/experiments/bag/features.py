@@ -47,7 +47,7 @@ def draw_features(encoder: PatchEncoder, seen: dict[str, np.ndarray]) -> Figure:
         seen: name -> uint8 (2, S, S, 3), as `see_variants` gives it.
     """
     images = torch.from_numpy(np.stack(list(seen.values()))).permute(0, 1, 4, 2, 3) / 255.0
-    tokens = torch.cat([encoder(pair) for pair in images]).unflatten(0, images.shape[:2])
+    tokens = torch.cat([encoder(pair).tokens for pair in images]).unflatten(0, images.shape[:2])
     colours = torch.stack([principal_colours(tokens[:, i]) for i in range(len(CAMERAS))], 1)
     side = round(colours.shape[-2] ** 0.5)
     n_rows = 2 * len(CAMERAS)
