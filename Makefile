@@ -13,6 +13,7 @@ demo: setup
 
 # The committed filter of the bag, or another, and the policy to be shielded, or none (BASE=):
 # make demo-bag POLICY=<filter> BASE=<policy>
+# Or a filter that is trained first, which sees by an encoder: make demo-bag ENCODER=facebook/dinov2-small
 POLICY ?= bag
 BASE ?= bag_diffusion_weak
 # Linux draws without a display by EGL; a Mac has its own way and refuses the name.
@@ -20,7 +21,8 @@ ifeq ($(shell uname -s),Linux)
 demo-bag: export MUJOCO_GL ?= egl
 endif
 demo-bag: setup
-	$(PYTHON) scripts/demo_bag.py --policy="$(POLICY)" $(if $(BASE),--base="$(BASE)")
+	$(if $(ENCODER),@scripts/setup_dino.sh)
+	$(PYTHON) scripts/demo_bag.py --policy="$(POLICY)" $(if $(BASE),--base="$(BASE)") $(if $(ENCODER),--encoder="$(ENCODER)")
 
 test: lint
 	HF_HUB_OFFLINE=1 $(PYTHON) -m pytest -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder

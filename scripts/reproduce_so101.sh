@@ -2,9 +2,15 @@
 # The SO-101: its data, two ACT policies, three filters and the comparison, from nothing, resumable: a step whose output
 # exists is skipped.
 #   scripts/reproduce_so101.sh [OUT]     OUT defaults to outputs/so101; recordings go to data, or to $DATA
+# WORLD_MODEL=dino_wm trains the filters on DINO-WMs instead, into outputs/so101_dino_wm, and compares nothing.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-OUT=${1:-outputs/so101} DATA=${DATA:-data} SEEDS=${SEEDS:-0 1 2}
+WORLD_MODEL=${WORLD_MODEL:-rssm} DATA=${DATA:-data} SEEDS=${SEEDS:-0 1 2}
+case $WORLD_MODEL in
+  rssm) OUT=${1:-outputs/so101} CACHE="$DATA/so101_cache" PICTURES="" ;;
+  dino_wm) OUT=${1:-outputs/so101_dino_wm} CACHE="$DATA/so101_tokens" PICTURES="--encoder=efficientnet_lite0 --image_size=64" ;;
+  *) echo "WORLD_MODEL is $WORLD_MODEL; expected rssm or dino_wm" >&2; exit 1 ;;
+esac
 BIN=.venv/bin
 export HF_HUB_OFFLINE=1 OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
 mkdir -p "$OUT"
@@ -27,26 +33,35 @@ act() { # what it learns from
 }
 
 filter() { # seed
-  local wm="$OUT/wm_$1" data="--dataset.repo_id=latentsafe/so101_cache --dataset.root=$DATA/so101_cache"
-  [ -e "$wm/checkpoints/last" ] || timed "world_model_$1" $BIN/lerobot-train --config_path=configs/so101_rssm.yaml $data \
-    --policy.frame_cache="$DATA/so101_cache" --output_dir="$wm" --seed="$1"
-  [ -e "$OUT/filter_$1" ] || timed "reachability_$1" $BIN/latentsafe train-reachability \
-    --policy.path="$wm/checkpoints/last/pretrained_model" $data --output_dir="$OUT/filter_$1" --seeds="[$1]"
+  local wm="$OUT/wm_$1" data="--dataset.repo_id=latentsafe/so101_cache --dataset.root=$CACHE"
+  local trained="$wm/checkpoints/last/pretrained_model"
+  [ -e "$wm/checkpoints/last" ] || timed "world_model_$1" $BIN/lerobot-train \
+    --config_path="configs/so101_$WORLD_MODEL.yaml" $data --policy.frame_cache="$CACHE" --output_dir="$wm" --seed="$1"
+  if [ "$WORLD_MODEL" = dino_wm ]; then
+    [ -e "$OUT/margin_$1" ] || timed "margin_$1" $BIN/latentsafe train-margin --policy.path="$trained" $data \
+      --output_dir="$OUT/margin_$1" --seed="$1"
+    trained="$OUT/margin_$1"
+  fi
+  [ -e "$OUT/filter_$1" ] || timed "reachability_$1" $BIN/latentsafe train-reachability --policy.path="$trained" $data \
+    --output_dir="$OUT/filter_$1" --seeds="[$1]"
 }
 
 record so101_reckless so101_reckless 1
 record so101_careful so101_careful 2
 record so101_mix so101_mix 0
-act reckless
-act careful
+if [ "$WORLD_MODEL" = rssm ]; then
+  act reckless
+  act careful
+fi
 [ -e "$DATA/so101" ] || $BIN/lerobot-edit-dataset --operation.type=merge --new_repo_id=latentsafe/so101 \
   --new_root="$DATA/so101" --operation.repo_ids="[latentsafe/so101_mix, latentsafe/so101_careful, latentsafe/so101_reckless]" \
   --operation.roots="[$DATA/so101_mix, $DATA/so101_careful, $DATA/so101_reckless]"
-[ -e "$DATA/so101_cache" ] || timed cache $BIN/latentsafe cache --dataset.repo_id=latentsafe/so101 \
-  --dataset.root="$DATA/so101" --output_dir="$DATA/so101_cache"
+[ -e "$CACHE" ] || timed cache $BIN/latentsafe cache --dataset.repo_id=latentsafe/so101 --dataset.root="$DATA/so101" \
+  --output_dir="$CACHE" $PICTURES
 for seed in $SEEDS; do
   filter "$seed"
 done
+[ "$WORLD_MODEL" = rssm ] || exit 0
 
 policies="$OUT/act_reckless/checkpoints/last/pretrained_model $OUT/act_careful/checkpoints/last/pretrained_model"
 $BIN/python scripts/so101_ranges.py --policies $policies --datasets "$DATA/so101_reckless" "$DATA/so101_careful"

@@ -3,18 +3,26 @@
 import importlib.util
 import json
 import sys
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import pytest
 import tiny
 import torch
+from lerobot.scripts import lerobot_edit_dataset
+from test_train import lerobot_train
 
-from lerobot_latentsafe.experiments.bag import demo, out_of_distribution, policies, runs
+from lerobot_latentsafe.cli import main as latentsafe
+from lerobot_latentsafe.encoders.patch_encoders import EncoderError, load_encoder
+from lerobot_latentsafe.experiments.bag import demo, demo_filter, out_of_distribution, policies, runs
 from lerobot_latentsafe.experiments.demo import Demo
 from lerobot_latentsafe.experiments.scene_world import SceneWorld
 from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES, action_limits
 from lerobot_latentsafe.franka.bag import BagScene
+from lerobot_latentsafe.franka.scenes import SCENES
+from lerobot_latentsafe.modeling_latentsafe import load_filter
 from lerobot_latentsafe.reports.html import PRINTED
 
 STEPS, SEEDS = 4, [runs.FIRST_SEED, runs.FIRST_SEED + 1]
@@ -113,6 +121,57 @@ def test_a_recording_is_replayed_on_every_variant(script, filter_path, tmp_path,
     assert rows["red"]["bare"]["spilled"]["k"] == 0 and rows["heavy"]["pooled"]["overridden_share"] == 1.0
     assert rows["law"] == "margin" and rows["filters"][filter_path]["guard"] == 1
     assert len(out_of_distribution.recording(SEEDS[0])) == STEPS and output.with_suffix(".png").exists()
+
+
+@pytest.fixture
+def encoder(tmp_path):
+    """A tiny DINOv2 where transformers is installed."""
+    return tiny.save_dino(tmp_path / "dino") if importlib.util.find_spec("transformers") else "efficientnet_lite0"
+
+
+def test_the_demo_trains_a_filter_that_sees_by_an_encoder(script, base_path, encoder, tmp_path, monkeypatch):
+    """All of its commands, in this process, on episodes of a second."""
+
+    def run(self, what, program, *options):
+        ran.append(what.split(":")[0])
+        if program == "python":
+            script(Path(options[0]).stem, *options[1:])
+        elif program == "latentsafe":
+            latentsafe(list(options))
+        elif program == "lerobot-train":
+            lerobot_train(*options, "--policy.margin.clips=16", "--policy.reachability.pool=512")
+        else:
+            monkeypatch.setattr(sys, "argv", [program, *options])
+            lerobot_edit_dataset.main()
+
+    ran = []
+    monkeypatch.setattr(Demo, "run", run)
+    monkeypatch.setitem(SCENES, "bag", replace(SCENES["bag"], episode_seconds=4.0, image_size=56))
+    monkeypatch.setattr(demo_filter, "SOURCES", ("bag_mix", "bag_lifts"))
+    monkeypatch.setattr(demo, "ThreadPoolExecutor", lambda n: ThreadPoolExecutor(1))
+    size = 2 * load_encoder(encoder).patch
+    options = [f"--out={tmp_path / 'demo'}", f"--encoder={encoder}", "--episodes=2", "--n=1", f"--base={base_path}"]
+    script("demo_bag", *options, f"--image_size={size}", "--steps=2", "--critic_steps=2")
+    assert ran == [
+        "collect bag_mix", "collect bag_lifts", "merge", "cache", "world model", "margin", "reachability", "policies",
+        "closed_end", "open_end",
+    ]  # fmt: skip
+    assert "the same, shielded" in json.loads((tmp_path / "demo" / "metrics.json").read_text())
+    perception = load_filter(tmp_path / "demo" / "filter").config.world_model.perception
+    assert perception.encoder == encoder and perception.token_components == 16
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        (["--encoder=me/nowhere"], EncoderError, "me/nowhere"),
+        (["--encoder=efficientnet_lite0", "--image_size=100"], ValueError, "multiple of 16 pixels, got"),
+    ],
+)
+def test_the_demo_records_nothing_for_an_encoder_that_cannot_see(script, tmp_path, options, error, message):
+    with pytest.raises(error, match=message):
+        script("demo_bag", f"--out={tmp_path / 'demo'}", *options)
+    assert not (tmp_path / "demo").exists()
 
 
 def test_a_command_that_fails_shows_the_end_of_its_log(tmp_path, capsys):

@@ -64,6 +64,11 @@ def test_ticks_of_the_law_are_steps_of_the_model(skipping, monkeypatch, ticks, s
     assert taken == [SKIP * tiny.ACTION_DIM] * (1 + steps)  # one to take in what is seen
 
 
+def test_episodes_shorter_than_a_step_are_refused(cache_meta):
+    with pytest.raises(ValueError, match=r"frame_skip is 1000, and the longest episode has \d+ frames"):
+        tiny.new_policy(cache_meta, world_model=tiny.rssm_config(frame_skip=1000))
+
+
 def test_no_skip_below_one_tick():
     with pytest.raises(ValueError, match="frame_skip is 0; expected at least 1"):
         tiny.rssm_config(frame_skip=0)

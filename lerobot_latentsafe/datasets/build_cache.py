@@ -178,10 +178,10 @@ class Tokens:
                     f"--token_components is {n}, and the cache in {self.basis_from} keeps {n_other}; give the same, or "
                     "0 for whole tokens"
                 )
-            if other.manifest["percepts"] != self.manifest["percepts"]:
+            if other.manifest["percepts"] != list(self.perception.sizes):
                 raise FrameCacheError(
                     f"the cache in {self.basis_from} holds {', '.join(other.manifest['percepts'])}, and this one is to "
-                    f"hold {', '.join(self.manifest['percepts'])}; an older version made it, build it anew"
+                    f"hold {', '.join(self.perception.sizes)}; an older version made it, build it anew"
                 )
             shutil.copyfile(basis_file(self.basis_from), folder / BASIS)
             return

@@ -144,8 +144,18 @@ class FilterData:
             check_proportions(key, self.cameras[key], shape)
 
     def reader(self, world_model: WorldModelSizes, units: Units) -> "ClipReader":
-        """Clips for a world model of these sizes, in these units."""
+        """Clips for a world model of these sizes, in these units.
+
+        Raises:
+            ValueError: no episode is as long as a step of the world model.
+        """
         numbers, sizes = self.cache or self.contract, world_model
+        longest = int(np.unique(self.labels.episode, return_counts=True)[1].max())
+        if longest <= sizes.frame_skip:
+            raise ValueError(
+                f"world_model.frame_skip is {sizes.frame_skip}, and the longest episode has {longest} frames: none "
+                "holds a step of the world model. Give a smaller frame_skip, or record longer episodes"
+            )
         return ClipReader(
             self.labels, self.cache, sizes.clip_length, units, sizes.frame_skip, numbers.state, numbers.action
         )

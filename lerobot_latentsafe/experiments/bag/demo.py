@@ -5,6 +5,7 @@ import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from lerobot_latentsafe.experiments.bag.demo_filter import FilterSizes, train_filter
 from lerobot_latentsafe.experiments.demo import NO_GUARANTEE, SIDE_BY_SIDE, Demo
 from lerobot_latentsafe.experiments.filter_settings import law_of
 from lerobot_latentsafe.model_card import rate_in_words
@@ -37,20 +38,28 @@ def run_experiments(demo: Demo, filter: str, base: str | None, law: str, n: int)
             done.result()
 
 
-def run_demo(out: Path, filter: str, base: str | None, n: int) -> None:
+def run_demo(out: Path, filter: str, base: str | None, n: int, encoder: str | None, sizes: FilterSizes) -> None:
     """Run the experiments, and write report.html and metrics.json.
 
     Args:
         out: folder; what is there is deleted.
         filter, base: paths of the filter, and of a policy to shield.
         n: starts of the policy; operators get half as many.
+        encoder: by which a filter is trained first, which takes the place of `filter`; None: none is trained.
+        sizes: of that training.
     """
-    law = law_of(filter).name
+    if encoder is None:  # whatever is wrong is said before anything is deleted
+        law_of(filter)
+    else:
+        sizes = sizes.fitting(encoder)
     if base is not None:
         resolve_checkpoint(base)
     if out.exists():
         shutil.rmtree(out)
     demo = Demo(out)
+    if encoder is not None:
+        filter = train_filter(demo, encoder, sizes)
+    law = law_of(filter).name
     run_experiments(demo, filter, base, law, n)
     report(out, law, demo.seconds)
 
