@@ -79,7 +79,7 @@ aggregate_datasets([f"latentsafe/{p}" for p in parts], "latentsafe/bag", [data /
 EOF
 tokens bag
 for held in held_branches held_lifts held_policies; do
-  tokens "$held" --basis_from="$DATA/bag_tokens"
+  tokens "$held" --basis_from="$DATA/bag_tokens" --token_components=0 # world models are compared by whole tokens
 done
 
 for seed in $SEEDS; do

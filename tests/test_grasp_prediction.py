@@ -9,6 +9,7 @@ from lerobot.utils.constants import OBS_ENV_STATE
 from safetensors.torch import load_file, save_file
 
 from lerobot_latentsafe.base_policy import BasePolicy
+from lerobot_latentsafe.datasets.build_cache import build_frame_cache
 from lerobot_latentsafe.datasets.frame_cache import FrameCache, FrameCacheError
 from lerobot_latentsafe.dubins.car import ACTION_NAMES, STATE_NAMES
 from lerobot_latentsafe.encoders.perception import EncoderMismatchError
@@ -153,3 +154,10 @@ def test_aims_of_another_dataset_are_refused(seen, token_root, tmp_path):
 def test_pictures_are_no_views(cache_root, tmp_path):
     with pytest.raises(EncoderMismatchError, match="holds pictures"):
         with_aim(cache_root, REPO_ID, tmp_path / "seen", **AIMED)
+
+
+def test_components_of_tokens_are_refused(dataset_root, tmp_path):
+    recipe = tiny.tokens(config=tiny.perception_config(token_components=3))
+    build_frame_cache(LeRobotDataset(tiny.REPO_ID, root=dataset_root), tmp_path / "few", tiny.TOKEN_SIZE, recipe)
+    with pytest.raises(EncoderMismatchError, match=r"token_components 3, .*--token_components"):
+        with_aim(tmp_path / "few", f"{tiny.REPO_ID}_cache", tmp_path / "seen", switch="turn_rate", moved=["cos"])

@@ -82,7 +82,7 @@ def with_aim(
         ValueError: no such command, or it hardly ever falls.
     """
     cache, dataset = FrameCache.open(cache_root), LeRobotDataset(repo_id, root=cache_root)
-    PerceptionConfig().of_cache(cache.manifest)
+    PerceptionConfig(token_components=0).of_cache(cache.manifest)  # at deployment it sees whole tokens
     move, episode = _motions_until_grasp(cache, dataset, switch, moved)
     move, odd = torch.from_numpy(move).to(device), torch.from_numpy(episode % 2 == 1).to(device)
     if not (move[odd].any() and move[~odd].any()):

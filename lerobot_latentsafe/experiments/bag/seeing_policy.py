@@ -73,7 +73,7 @@ def encode(dataset: Path, repo_id: str) -> Path:
     meta = LeRobotDatasetMetadata(repo_id, root=dataset)  # refuse what is no dataset before any work
     tokens = dataset.with_name(f"{dataset.name}_tokens")
     if not (tokens / FOLDER / MANIFEST).exists():
-        command = [sys.executable, "-m", "lerobot_latentsafe.cli", "cache", "--encoder=auto"]
+        command = [sys.executable, "-m", "lerobot_latentsafe.cli", "cache", "--encoder=auto", "--token_components=0"]
         command += [f"--dataset.repo_id={repo_id}", f"--dataset.root={dataset}"]
         subprocess.run([*command, f"--output_dir={tokens}"], check=True)
     FrameCache.open(tokens, meta)  # refuse what was made of another dataset
