@@ -27,7 +27,7 @@ APART = 0.2
 """An alteration is told where every frame of the dataset is on its side by so much; the means are at -1 and 1."""
 SAME = 0.004
 """Thumbnails that differ nowhere by more are the same picture, encoded again: a grey level."""
-KEPT, REPEATS = 8, 2
+KEPT, REPEATS = 8, 3
 """Different pictures that are remembered; and ticks in a row after which a picture that comes again is an old one."""
 MOVED, MOVED_UNSEEN = 0.05, 0.15
 """Standard deviations by which a number of the state may always change unseen, by a camera whose look is not known; and
