@@ -279,6 +279,11 @@ def first_fault(fault: Tensor, where: Tensor, reason: Reason) -> Tensor:
     return torch.where((fault == Reason.PASSED) & where, int(reason), fault)
 
 
+def or_else(fault: Tensor, found: Tensor | int) -> Tensor:
+    """The faults (B,), and of rows that have none what was found later: a `Reason` for each (B,), or for all."""
+    return torch.where(fault == Reason.PASSED, found, fault)
+
+
 def first_of(found: dict[Reason, Tensor]) -> Tensor:
     """The first reason that holds for each row, or PASSED: (B,) of bool (B,) for each reason, in order."""
     rank, reasons = _ranked(tuple(found), next(iter(found.values())).device)

@@ -15,7 +15,7 @@ import torch
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
-from lerobot_latentsafe.decision import Reason, first_of
+from lerobot_latentsafe.decision import Reason, first_of, or_else
 from lerobot_latentsafe.looks import SIDE, Cameras, Response
 from lerobot_latentsafe.pictures import check_proportions
 from lerobot_latentsafe.safety_model import SafetyModel
@@ -313,7 +313,7 @@ class Guard:
             proposed = planned = None
             missing_reason = Reason.BASE_POLICY_FAILED
         if proposed is None:
-            fault = torch.where(fault == Reason.PASSED, int(missing_reason), fault)
+            fault = or_else(fault, int(missing_reason))
             proposed = hold
         proposed = self.model.place(proposed).float()
         finite = torch.isfinite(proposed).all(-1)
@@ -329,13 +329,13 @@ class Guard:
                 Reason.OBSERVATION_STALE: mute,
             }
         )
-        fault = torch.where(fault == Reason.PASSED, found, fault)
+        fault = or_else(fault, found)
         if planned is not None:
             plan = torch.cat([clipped[:, None], self.model.place(planned).float()], 1)
             coming = check_plan(units, plan)[:, 1:]
             order = (Reason.ACTION_NOT_FINITE, Reason.ACTION_OUT_OF_RANGE, Reason.ACTION_JUMPS)
             found = first_of({reason: (coming == reason).any(1) for reason in order})
-            fault = torch.where(fault == Reason.PASSED, found, fault)
+            fault = or_else(fault, found)
         self._proposals.append(clipped)
         return fault, proposed, self._tell_clipped(proposed, clipped, fault)
 

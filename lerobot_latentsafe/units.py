@@ -304,8 +304,7 @@ class Units(nn.Module):
         Args:
             action: (..., A), or of several ticks side by side (..., K A).
         """
-        ticks = action.unflatten(-1, (-1, len(self.frozen)))
-        return torch.where(self.frozen, ticks, 0.0).flatten(-2)
+        return self._frozen_or(action, 0.0)
 
     # -- in range ---
 
@@ -381,8 +380,12 @@ class Units(nn.Module):
 
     def still_as(self, action: Tensor) -> Tensor:
         """Standing still for as many ticks as an action (..., K A) has, inside; frozen commands as they are there."""
+        return self._frozen_or(action, self.still[0])
+
+    def _frozen_or(self, action: Tensor, other: Tensor | float) -> Tensor:
+        """An action of several ticks (..., K A) with all but its frozen commands replaced, by (A,) for each tick."""
         ticks = action.unflatten(-1, (-1, len(self.frozen)))
-        return torch.where(self.frozen, ticks, self.still[0]).flatten(-2)
+        return torch.where(self.frozen, ticks, other).flatten(-2)
 
     def moves(self, state: Tensor, before: Tensor) -> Tensor:
         """Whether what each target is of moved from one state (B, S) to the next: bool (B, A)."""

@@ -442,6 +442,17 @@ def test_robot_is_held_when_even_the_latent_is_not_finite(permissive):
         torch.testing.assert_close(decision.action, permissive.model.units.hold(torch.zeros(3, 2)))
 
 
+@pytest.mark.parametrize(
+    "plan",
+    [torch.zeros(3, 2), torch.zeros(2, 4, 2), torch.zeros(3, 4, 3), torch.zeros(3, 4, 2).to_sparse(), [[0.0, 1.0]]],
+    ids=["of one action", "of two robots", "of a number more", "sparse", "a list"],
+)
+def test_a_plan_of_another_shape_does_not_pass(permissive, plan, caplog):
+    decision = permissive.shield(along(1)[0], actions(LEFT, LEFT, LEFT), planned=plan)
+    assert decision.reason.eq(Reason.BASE_POLICY_FAILED).all() and decision.intervened.all()
+    assert "expected one of (robots, actions, 2)" in caplog.text
+
+
 def test_hold_is_zero_motion_or_the_nearest_the_range_allows(policy):
     assert policy.model.units.hold(torch.zeros(2, 2)).tolist() == [[0.0, 1.0]] * 2  # the speed never varies
     forward = replace(policy.config.trained_on, action_low=[0.25, 1.0], action_high=[0.75, 1.0])
