@@ -279,10 +279,10 @@ def test_merged_patches_come_apart_again():
     assert torch.equal(model.tokens_of(latent), tokens)  # without an encoder, tokens are whole
 
 
-@pytest.mark.parametrize("conditioning", ["adaln", "concat"])
+@pytest.mark.parametrize("options", [{}, {"memory": 0}, {"conditioning": "concat"}])
 @torch.no_grad()
-def test_streaming_with_a_frame_token_equals_the_full_forward(conditioning):
-    model, clip = build_merged(conditioning=conditioning).eval(), merged_clip(length=12)
+def test_streaming_with_a_frame_token_equals_the_full_forward(options):
+    model, clip = build_merged(**options).eval(), merged_clip(length=12)
     frames = {**model._looked_at(clip.percepts), "state": clip.state}
     seen = model._frames_seen(clip.is_first)
     known = {name: values[:, :-1] for name, values in frames.items()}
@@ -298,8 +298,8 @@ def test_streaming_with_a_frame_token_equals_the_full_forward(conditioning):
 
 
 def test_every_parameter_of_the_recipe_learns():
-    for conditioning in ("adaln", "concat"):
-        model = build_merged(conditioning=conditioning).train()
+    for options in ({}, {"memory": 0}, {"conditioning": "concat"}):
+        model = build_merged(**options).train()
         loss, features, metrics = model.loss(merged_clip())
         (loss + features.square().sum()).backward()
         idle = {name for name, p in model.named_parameters() if p.grad is None or not p.grad.any()}

@@ -235,13 +235,11 @@ def test_a_frame_token_of_class_tokens_is_cached_trained_and_seen(kind, dataset,
     images = torch.stack([dataset[int(i)]["observation.image"] for i in index])
     seen = model.perceive({"observation.image": to_model_images(images, 224)})
     cached, _ = cache.frames(index, model.percept_names)
-    for name in ("tokens", "class"):
+    for name in ("tokens", "vector", "class"):
         torch.testing.assert_close(cached[name], seen[name], rtol=5e-3, atol=5e-3)
     latent = model.correct(model.initial(3), cached, torch.zeros(3, 2))
-    lifted = model.patches.lift(cached["tokens"])  # class tokens tell of no patch
-    torch.testing.assert_close(model.tokens_of(latent), lifted)
-    stored = {name for name in policy.state_dict() if "class_scale" in name or "basis" in name}
-    assert stored == {f"model.world_model.class_scale.{name}" for name in ("mean", "std", "fitted")}
+    torch.testing.assert_close(model.basis(model.tokens_of(latent)), cached["vector"], rtol=1e-3, atol=1e-3)
+    assert {f"model.world_model.class_scale.{name}" for name in ("mean", "std", "fitted")} < set(policy.state_dict())
     with pytest.raises(ValueError, match="do not fill the grid"):
         dino_wm_policy(tmp_path / "tokens", **small, merge_patches=3)
 
@@ -267,6 +265,21 @@ def test_large_tokens_are_sampled_less(dataset, token_root, tmp_path, monkeypatc
     monkeypatch.setattr(Perception, "fit", lambda self, seen: sampled.append(len(seen.tokens)) or fit(self, seen))
     build_frame_cache(dataset, tmp_path / "new", tiny.TOKEN_SIZE, tiny.tokens())
     assert 100 <= sampled[0] < 100 + dataset.num_episodes
+
+
+def test_components_of_patches_tell_what_those_of_the_frame_leave_unsaid(component_root, token_root):
+    model = dino_wm_policy(component_root).model.world_model
+    whole, cached = (FrameCache.open(root).frames(np.arange(50))[0] for root in (token_root, component_root))
+    unsaid = model.basis.unsaid(whole["tokens"])
+    assert model.basis(unsaid + model.basis.mean.view(unsaid.shape[1:])).abs().max() < 1e-2
+    torch.testing.assert_close(cached["tokens"], model.patches(unsaid), rtol=5e-3, atol=5e-3)
+    said = model.tokens_of(model.correct(model.initial(50), cached, torch.zeros(50, 2)))
+    assert (said - whole["tokens"]).norm() < 0.9 * unsaid.norm()
+
+
+def test_components_of_patches_alone_are_no_frame(component_root):
+    with pytest.raises(ValueError, match=r"frame_token is false.*leave unsaid.*--token_components=0"):
+        dino_wm_policy(component_root, frame_token=False)
 
 
 def test_the_more_components_the_nearer_to_the_tokens(dataset, token_root, component_root):

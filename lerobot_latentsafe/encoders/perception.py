@@ -28,8 +28,8 @@ class PerceptionConfig:
         encoder_hash: of its weights; filled in by training, and checked whenever the encoder is loaded again.
         basis_hash: of the principal components, filled in by training.
         components: principal components of a whole frame's tokens.
-        token_components: principal components of a patch, of each camera, that stand for its token; 0: whole tokens;
-            None: what the token cache holds.
+        token_components: principal components of what the frame's components leave unsaid of a patch, of each camera,
+            that stand for its token; 0: whole tokens; None: what the token cache holds.
     """
 
     encoder: str = "auto"
@@ -88,7 +88,11 @@ class FrameBasis(nn.Module):
 
     def lift(self, components: Tensor) -> Tensor:
         """Components of frames (..., K) -> the flattened tokens (..., P C) nearest to the mean that have them."""
-        return components @ torch.linalg.solve(self.axes.T @ self.axes, self.axes.T) + self.mean
+        return components @ (self.axes / self.axes.square().sum(0).clamp(min=1e-12)).T + self.mean  # orthogonal axes
+
+    def unsaid(self, tokens: Tensor) -> Tensor:
+        """What its components leave unsaid of a frame's tokens (..., P, C)."""
+        return tokens - self.lift(self(tokens)).unflatten(-1, tokens.shape[-2:])
 
     @torch.no_grad()
     def fit(self, tokens: Tensor) -> None:
@@ -106,7 +110,7 @@ class FrameBasis(nn.Module):
 
 
 class PatchBasis(nn.Module):
-    """Principal components of each camera's patch tokens, the first of them of unit variance.
+    """Principal components of what is left of each camera's patch tokens, the first of them of unit variance.
 
     Tokens (..., P, cameras x C) -> (..., P, cameras x K).
     """
@@ -193,8 +197,9 @@ def _require_fitted(fitted: Tensor) -> None:
 class Perception(nn.Module):
     """Images -> what is kept of them, by name; `config` names the encoder found. That is
 
-        tokens (B, P, token_dim)      whole, a patch of each camera side by side, or each camera's `token_components`
         vector (B, components)        principal components of the whole frame
+        tokens (B, P, token_dim)      whole, a patch of each camera side by side; or each camera's `token_components`
+                                      of what `vector` leaves unsaid
         class (B, cameras x dim)      the cameras' class tokens side by side, on one scale, of an encoder that has them
 
     The encoder's weights are not part of a checkpoint; its name and hash in the configuration are.
@@ -272,7 +277,7 @@ class Perception(nn.Module):
         """Principal components, and the scale of class tokens, of a sample of frames (N, ...)."""
         self.basis.fit(seen.tokens)
         if self.patches is not None:
-            self.patches.fit(seen.tokens)
+            self.patches.fit(self.basis.unsaid(seen.tokens))
         if self.class_scale is not None and seen.class_token is not None:
             self.class_scale.fit(seen.class_token)
 
@@ -330,4 +335,4 @@ class Perception(nn.Module):
     def cut_down(self, tokens: Tensor) -> Tensor:
         """Tokens (..., P, C), whole or cut down already, as they are kept."""
         whole = tokens.shape[-1] != self.token_dim
-        return self.patches(tokens) if whole and self.patches is not None else tokens
+        return self.patches(self.basis.unsaid(tokens)) if whole and self.patches is not None else tokens

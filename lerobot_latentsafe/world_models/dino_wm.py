@@ -11,9 +11,10 @@ next hardly anything changes, and texture that nothing can predict drowns what t
 * action and proprioception modulate every layer (AdaLN);
 * the rest of each clip is imagined from its start (open loop);
 * a step of the model is several ticks of the robot (`frame_skip`);
-* tokens are principal components of what the encoder says, four patches side by side (`merge_patches`);
-* a frame token carries the components of the whole frame, or the encoder's class tokens, and most of the loss weighs on
-  it.
+* a frame token carries the principal components of the whole frame, and most of the loss weighs on it;
+* a recurrent memory of the frame tokens tells all layers what happened before, and the frame token what comes next;
+* the other tokens carry what these leave unsaid, as principal components of a patch, four patches side by side
+  (`merge_patches`).
 """
 
 import math
@@ -36,8 +37,8 @@ from lerobot_latentsafe.world_models.patch_summary import PatchSummary
 from lerobot_latentsafe.world_models.termination import TerminationHead
 
 CONDITIONINGS = ("adaln", "concat")
-FRAME_PERCEPTS = {"components": "vector", "class": "class"}
-"""What a frame token may carry -> the percept that holds it."""
+FRAME_PERCEPTS = {"components": ["vector"], "class": ["vector", "class"]}
+"""What a frame token may carry -> the percepts that hold it."""
 MOST_WEIGHT = 5.0
 """The error of a token that changes weighs at most so many times the average."""
 
@@ -62,8 +63,10 @@ class DinoWMConfig(WorldModelConfig):
         change_weight: share of a token error's weight that follows how much the token changes.
         merge_patches: so many patches a side, side by side, are one token.
         frame_token: whether a token beside the patches stands for the whole frame.
-        frame_percept: what it carries: the frame's principal components (`components`), or the class token of each
-            camera (`class`), of an encoder that has them: DINOv2 and DINOv3 do, efficientnet_lite0 does not.
+        frame_percept: what it carries: the frame's principal components (`components`); or these and the class token
+            of each camera (`class`), of an encoder that has them: DINOv2 and DINOv3 do, efficientnet_lite0 does not.
+        memory: width of the recurrent memory that a frame token has; 0: none, what was before is in keys and values
+            alone.
         token_weight, frame_weight: of the errors of patches, and of the frame token.
         blind: see no images, only proprioception: the control that a model which looks must beat.
     """
@@ -88,6 +91,7 @@ class DinoWMConfig(WorldModelConfig):
     merge_patches: int = 2
     frame_token: bool = True
     frame_percept: str = "components"
+    memory: int = 256
     token_weight: float = 0.1
     frame_weight: float = 1.0
     blind: bool = False
@@ -131,7 +135,13 @@ class DinoWMConfig(WorldModelConfig):
         perception = Perception(self.perception, image_keys, self.image_size)
         if self.reads_class_tokens and perception.class_scale is None:
             raise ValueError(_no_class_token(perception.config.encoder))
-        n_frame = perception.sizes[FRAME_PERCEPTS[self.frame_percept]][0]
+        if perception.patches is not None and not self.frame_token:
+            raise ValueError(
+                f"world_model.frame_token is false, and the {perception.config.token_components} components of a token "
+                "are of what the frame's components leave unsaid; build the cache with whole tokens (latentsafe cache "
+                "--token_components=0), or keep the frame token"
+            )
+        n_frame = sum(perception.sizes[name][0] for name in FRAME_PERCEPTS[self.frame_percept])
         sizes = (perception.n_patches, perception.token_dim, n_frame)
         return DinoWM(self, image_keys, state_dim, action_dim, *sizes, perception)
 
@@ -153,11 +163,12 @@ class _Ahead(NamedTuple):
     kept: list[Tensor]
 
 
-def _change_decoder(n_in: int, n_layers: int, n_out: int) -> nn.Sequential:
+def _change_decoder(n_in: int, n_layers: int, n_out: int, n_hidden: int | None = None) -> nn.Sequential:
     """Predicts a change, and starts near the best guess without learning: nothing changes."""
     layers: list[nn.Module] = []
     for _ in range(n_layers - 1):
-        layers += [nn.Linear(n_in, n_in), nn.GELU()]
+        n_in, n_before = n_hidden or n_in, n_in
+        layers += [nn.Linear(n_before, n_in), nn.GELU()]
     last = nn.Linear(n_in, n_out)
     with torch.no_grad():
         last.weight.mul_(0.1)
@@ -170,14 +181,15 @@ class DinoWM(TerminationHead):
 
         tokens (B, P, C), state (B, S)    of the frame, seen or imagined
         vector (B, F)                     of the whole frame, with a frame token; P counts it for past_i
-        context (B, d)                    what the frames before said of it: the transformer's output, mean over patches
+        context (B, M)                    what the frames before said of it: the memory; without one, the transformer's
+                                          output, mean over patches
         seen (B,)                         frames known, this one included, at most H; 0 before the first
         past_i (B, H - 1, P, 2 K)         keys and values of the frames before in layer i
         action (B, A)                     that led here
 
     Args:
         n_patches, token_dim: of the percepts, before patches are merged to P tokens of C numbers.
-        n_frame: F, numbers that a frame token carries; by default all components.
+        n_frame: F, numbers that a frame token carries; by default all of the frame's components.
         perception: what makes tokens of images; without it the model reads tokens only.
     """
 
@@ -192,13 +204,13 @@ class DinoWM(TerminationHead):
         self.image_keys, self.action_dim = sorted(image_keys), action_dim
         self._perception = [perception]  # in a list, so that the encoder is not part of the checkpoint
         self.patches = None if perception is None else perception.patches
-        reads = None if perception is None else self._frame_percept
-        self.basis = perception.basis if reads == "vector" else None
-        self.class_scale = perception.class_scale if reads == "class" else None
+        self.basis = perception.basis if perception is not None and config.frame_token else None
+        self.class_scale = perception.class_scale if perception is not None and config.reads_class_tokens else None
         self._grid = (*_merged_grid(n_patches, config.merge_patches), config.merge_patches)
         n_tokens, token_dim = self._grid[0] * self._grid[1], token_dim * config.merge_patches**2
         d, width = config.dim, config.summary
         n_frame = n_frame or config.perception.components
+        self.memory_dim = config.memory if config.frame_token else 0
         self._build_inputs(n_tokens, token_dim, n_frame, state_dim)
         condition_dim = d if config.conditioning == "adaln" else None
         self.transformer = FrameTransformer(
@@ -208,24 +220,31 @@ class DinoWM(TerminationHead):
         self.decoders = nn.ModuleList(
             _change_decoder(d, config.decoder_layers, token_dim // len(image_keys)) for _ in self.image_keys
         )
-        self.state_decoder = _change_decoder(d + state_dim + action_dim, config.decoder_layers, state_dim)
         self.summary = PatchSummary(n_tokens, token_dim, width)
-        self.feature_dim = 2 * width + d + state_dim
-        self.sizes = {"tokens": (n_tokens, token_dim), "state": (state_dim,), "context": (d,), "action": (action_dim,)}
+        n_context = self.memory_dim or d
+        n_told = n_context + state_dim + self.action_dim
+        self.feature_dim = 2 * width + n_context + state_dim
+        self.sizes = {"tokens": (n_tokens, token_dim), "state": (state_dim,), "context": (n_context,)}
+        self.sizes["action"] = (action_dim,)
         if config.frame_token:
-            self.frame_decoder = _change_decoder(d, 2, n_frame)
+            self.frame_decoder = _change_decoder(d + n_frame + n_told, 2, n_frame + state_dim, n_context)
             self.sizes["vector"] = (n_frame,)
             self.feature_dim += n_frame
+        else:
+            self.state_decoder = _change_decoder(n_told, config.decoder_layers, state_dim)
         self.seen_names: list[str] = [name for name in ("tokens", "vector", "state") if name in self.sizes]
         self.continues = nn.Sequential(nn.Linear(self.feature_dim, 64), nn.SiLU(), nn.Linear(64, 1))
 
     def _build_inputs(self, n_tokens: int, token_dim: int, n_frame: int, state_dim: int) -> None:
         config, d = self.config, self.config.dim
         width = d
+        if self.memory_dim:
+            n_heard = n_frame + state_dim + self.action_dim
+            self.memory_in = nn.Sequential(nn.Linear(n_heard, self.memory_dim), nn.SiLU())
+            self.memory = nn.GRUCell(self.memory_dim, self.memory_dim)
         if config.conditioning == "adaln":
-            self.condition_in = nn.Sequential(
-                nn.Linear(state_dim + self.action_dim, d), nn.SiLU(), nn.Linear(d, d), nn.SiLU()
-            )
+            n_told = state_dim + self.action_dim + self.memory_dim
+            self.condition_in = nn.Sequential(nn.Linear(n_told, d), nn.SiLU(), nn.Linear(d, d), nn.SiLU())
         else:
             self.state_in = nn.Linear(state_dim, config.embedding)
             self.action_in = nn.Linear(self.action_dim, config.embedding)
@@ -241,11 +260,11 @@ class DinoWM(TerminationHead):
     @property
     def percept_names(self) -> list[str]:
         """Tokens of the frame, and what of the whole of it a frame token carries."""
-        return ["tokens", self._frame_percept] if self._frame_percept else ["tokens"]
+        return ["tokens", *self._frame_percepts]
 
     @property
-    def _frame_percept(self) -> str | None:
-        return FRAME_PERCEPTS[self.config.frame_percept] if self.config.frame_token else None
+    def _frame_percepts(self) -> list[str]:
+        return FRAME_PERCEPTS[self.config.frame_percept] if self.config.frame_token else []
 
     def load_basis(self, root: Path) -> None:
         """Principal components, or the scale of class tokens, from a dataset's token cache."""
@@ -271,7 +290,7 @@ class DinoWM(TerminationHead):
         """Next latent under actions (B, A), from the frame and the H - 1 before it."""
         past = [latent[name] for name in self.past_names]
         now = {name: latent[name][:, None] for name in self.seen_names}
-        ahead = self._advance(now, action[:, None], latent["seen"][:, None], past=past)
+        ahead = self._advance(now, action[:, None], latent["seen"][:, None], past, latent["context"])
         return self._next_latent(ahead, 0, latent["seen"], action)
 
     def correct(self, predicted: Latent, percepts: dict[str, Tensor], state: Tensor) -> Latent:
@@ -292,9 +311,9 @@ class DinoWM(TerminationHead):
             return None
         tokens = self._apart(latent["tokens"])
         if self.patches is not None:
-            tokens = self.patches.lift(tokens)
+            tokens = self.patches.lift(tokens) + self.basis.mean.unflatten(-1, (tokens.shape[-2], -1))
         if self.basis is not None:  # the frame's components are foretold by themselves
-            missing = latent["vector"] - self.basis(tokens)
+            missing = latent["vector"][..., : self.config.perception.components] - self.basis(tokens)
             tokens = tokens + (self.basis.lift(missing) - self.basis.mean).unflatten(-1, tokens.shape[-2:])
         return tokens
 
@@ -312,8 +331,8 @@ class DinoWM(TerminationHead):
     def _looked_at(self, percepts: dict[str, Tensor]) -> dict[str, Tensor]:
         """What is seen of frames: tokens (..., P, C), and vector (..., F) with a frame token."""
         seen = {"tokens": self._merged(percepts["tokens"])}
-        if self._frame_percept:
-            seen["vector"] = percepts[self._frame_percept]
+        if self._frame_percepts:
+            seen["vector"] = torch.cat([percepts[name] for name in self._frame_percepts], -1)
         return {name: torch.zeros_like(value) for name, value in seen.items()} if self.config.blind else seen
 
     def _merged(self, tokens: Tensor) -> Tensor:
@@ -333,37 +352,59 @@ class DinoWM(TerminationHead):
         return apart.movedim((-6, -5, -4), (-6, -4, -2)).flatten(-2).flatten(-5, -2)
 
     def _advance(
-        self, frames: dict[str, Tensor], action: Tensor, seen: Tensor, *, past: list[Tensor] | None = None
-    ) -> _Ahead:
+        self, frames: dict[str, Tensor], action: Tensor, seen: Tensor, past: list[Tensor] | None = None,
+        context: Tensor | None = None,
+    ) -> _Ahead:  # fmt: skip
         """One step ahead of each of T frames, under the actions taken there.
 
         Args:
             frames: tokens (B, T, P, C), state (B, T, S) and perhaps vector (B, T, F).
             action: (B, T, A).
             seen: (B, T), and past: as in the transformer.
+            context: (B, M), of the first of them; None if nothing was before.
         """
-        x, condition = self._embed(frames, action)
+        state, known = frames["state"], (seen > 0)[..., None]
+        told = [state, action, *self._remembered(frames, action, seen, context)]
+        x, condition = self._embed(frames, told)
         x, kept = self.transformer(x, seen, past, condition)
-        context, state = x.mean(-2), frames["state"]
         patches = x[..., : frames["tokens"].shape[-2], :]
+        told = told if self.memory_dim else [*told, x.mean(-2)]
         ahead = {
             "tokens": frames["tokens"] + torch.cat([decoder(patches) for decoder in self.decoders], -1),
-            "state": state + self.state_decoder(torch.cat([context, state, action], -1)),
             # Of a first frame nothing was known before; what the empty latent led to must not say otherwise.
-            "context": context * (seen > 0)[..., None],
+            "context": told[-1] * known,
         }
-        if self.config.frame_token:
-            ahead["vector"] = frames["vector"] + self.frame_decoder(x[..., -1, :])
-        return _Ahead(ahead, kept)
+        if not self.config.frame_token:
+            return _Ahead({**ahead, "state": state + self.state_decoder(torch.cat(told, -1))}, kept)
+        change = self.frame_decoder(torch.cat([x[..., -1, :], frames["vector"], *told], -1))
+        vector, moved = change.split([frames["vector"].shape[-1], state.shape[-1]], -1)
+        return _Ahead({**ahead, "vector": frames["vector"] + vector, "state": state + moved}, kept)
 
-    def _embed(self, frames: dict[str, Tensor], action: Tensor) -> tuple[Tensor, Tensor | None]:
-        """The transformer's input (B, T, P, d), and with AdaLN the condition (B, T, d) of its layers."""
-        x, state = self.token_in(frames["tokens"]), frames["state"]
+    def _remembered(
+        self, frames: dict[str, Tensor], action: Tensor, seen: Tensor, memory: Tensor | None
+    ) -> list[Tensor]:
+        """The memory (B, T, M) after each of T frames, from that before them (B, M); nothing without a memory."""
+        if not self.memory_dim:
+            return []
+        told = self.memory_in(torch.cat([frames["vector"], frames["state"], action], -1))
+        memory, rows = told.new_zeros(len(told), self.memory_dim) if memory is None else memory, []
+        for t in range(told.shape[1]):
+            memory = self.memory(told[:, t], memory * (seen[:, t] > 1)[:, None])  # a first frame remembers nothing
+            rows.append(memory)
+        return [torch.stack(rows, 1)]
+
+    def _embed(self, frames: dict[str, Tensor], told: list[Tensor]) -> tuple[Tensor, Tensor | None]:
+        """The transformer's input (B, T, P, d), and with AdaLN the condition (B, T, d) of its layers.
+
+        Args:
+            told: state (B, T, S), action (B, T, A) and perhaps the memory.
+        """
+        x = self.token_in(frames["tokens"])
         if self.config.frame_token:
             x = torch.cat([x, self.frame_in(frames["vector"]).unsqueeze(-2)], -2)
         if self.config.conditioning == "adaln":
-            return x + self.position, self.condition_in(torch.cat([state, action], -1))
-        both = torch.cat([self.state_in(state), self.action_in(action)], -1).unsqueeze(-2)
+            return x + self.position, self.condition_in(torch.cat(told, -1))
+        both = torch.cat([self.state_in(told[0]), self.action_in(told[1])], -1).unsqueeze(-2)
         return torch.cat([x, both.expand(*x.shape[:-1], -1)], -1) + self.position, None
 
     def _next_latent(self, ahead: _Ahead, t: int, seen: Tensor, action: Tensor) -> Latent:
