@@ -2,11 +2,13 @@
 # The filter of the bag, the policies it shields and their experiments, from nothing, resumable: a step whose output
 # exists is skipped.
 #   scripts/reproduce_bag.sh [OUT]     OUT defaults to outputs/bag; recordings go to data, or to $DATA
+# WORLD_MODELS (dino_wm and gru), SEEDS and UNTIL (world_model, filter or all) say what of it is made.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-OUT=${1:-outputs/bag} DATA=${DATA:-data} SEEDS=${SEEDS:-0 1 2}
+OUT=${1:-outputs/bag} DATA=${DATA:-data} SEEDS=${SEEDS:-0 1 2} WORLD_MODELS=${WORLD_MODELS:-dino_wm gru} UNTIL=${UNTIL:-all}
 BIN=.venv/bin
 export HF_HUB_OFFLINE=1 OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
+CACHED="--dataset.repo_id=latentsafe/bag_cache --dataset.root=$DATA/bag_tokens"
 mkdir -p "$OUT"
 [ -e "$OUT/cost.csv" ] || echo "step,user_s,system_s" >"$OUT/cost.csv"
 
@@ -27,22 +29,30 @@ tokens() { # name [other options of latentsafe cache]
     --dataset.repo_id="latentsafe/$name" --dataset.root="$DATA/$name" --output_dir="$DATA/${name}_tokens" "$@"
 }
 
-filter() { # seed
-  local wm="$OUT/wm_$1" data="--dataset.repo_id=latentsafe/bag_cache --dataset.root=$DATA/bag_tokens"
+world_model() { # type seed: without a margin that was fitted anew, and without a critic
+  local wm="$OUT/wm_$1_$2"
   local last="$wm/checkpoints/last/pretrained_model"
-  if [ -e "$wm/checkpoints/last" ] && [ ! -e "$wm/done" ]; then
-    timed "world_model_$1" $BIN/lerobot-train --config_path="$last/train_config.json" --resume=true
-  elif [ ! -e "$wm/done" ]; then
+  [ ! -e "$wm/done" ] || return 0
+  if [ -e "$wm/checkpoints/last" ]; then
+    timed "world_model_$1_$2" $BIN/lerobot-train --config_path="$last/train_config.json" --resume=true
+  else
     rm -rf "$wm"
-    timed "world_model_$1" $BIN/lerobot-train --config_path=configs/bag_gru.yaml $data --policy.frame_cache="$DATA/bag_tokens" \
-      --output_dir="$wm" --seed="$1"
+    timed "world_model_$1_$2" $BIN/lerobot-train --config_path="configs/bag_$1.yaml" $CACHED \
+      --policy.frame_cache="$DATA/bag_tokens" --output_dir="$wm" --seed="$2"
   fi
   touch "$wm/done"
-  [ -e "$OUT/margin_$1/integrity.json" ] || timed "margin_$1" $BIN/latentsafe train-margin --policy.path="$last" $data \
-    --output_dir="$OUT/margin_$1" --seed="$1"
-  [ -e "$OUT/filter_$1/integrity.json" ] || timed "reachability_$1" $BIN/latentsafe train-reachability \
-    --policy.path="$OUT/margin_$1" $data --output_dir="$OUT/filter_$1" --seeds="[$1]"
-  [ -e "$OUT/final_$1" ] || $BIN/latentsafe wrap --policy.path="$OUT/filter_$1" --output_dir="$OUT/final_$1" --half=true
+}
+
+margin() { # type seed
+  [ -e "$OUT/margin_$1_$2/integrity.json" ] || timed "margin_$1_$2" $BIN/latentsafe train-margin \
+    --policy.path="$OUT/wm_$1_$2/checkpoints/last/pretrained_model" $CACHED --output_dir="$OUT/margin_$1_$2" --seed="$2"
+}
+
+filter() { # type seed
+  [ -e "$OUT/filter_$1_$2/integrity.json" ] || timed "reachability_$1_$2" $BIN/latentsafe train-reachability \
+    --policy.path="$OUT/margin_$1_$2" $CACHED --output_dir="$OUT/filter_$1_$2" --seeds="[$2]"
+  [ -e "$OUT/final_$1_$2" ] || $BIN/latentsafe wrap --policy.path="$OUT/filter_$1_$2" --output_dir="$OUT/final_$1_$2" \
+    --half=true
 }
 
 record bag_mix bag_mix 0 160
@@ -82,14 +92,31 @@ for held in held_branches held_lifts held_policies; do
   tokens "$held" --basis_from="$DATA/bag_tokens" --token_components=0 # world models are compared by whole tokens
 done
 
+models=()
 for seed in $SEEDS; do
-  filter "$seed"
-  for held in branches lifts policies; do
-    [ -e "results/bag/world_model_${held}_$seed.json" ] || $BIN/latentsafe eval-world-model \
-      --policy.path="$OUT/final_$seed" --dataset.repo_id="latentsafe/held_${held}_cache" \
-      --dataset.root="$DATA/held_${held}_tokens" --json="results/bag/world_model_${held}_$seed.json"
+  for type in $WORLD_MODELS; do
+    world_model "$type" "$seed"
+    margin "$type" "$seed"
+    models+=("${type}_$seed=$OUT/margin_${type}_$seed")
   done
 done
+[ -e results/bag/world_models.json ] || $BIN/python scripts/bag_world_models.py --models "${models[@]}" --data="$DATA" \
+  --cost="$OUT/cost.csv"
+[ "$UNTIL" != world_model ] || exit 0
+
+filters=()
+for seed in $SEEDS; do
+  for type in $WORLD_MODELS; do
+    filter "$type" "$seed"
+    filters+=("$OUT/final_${type}_$seed")
+    for held in branches lifts policies; do
+      result="results/bag/world_model_${held}_${type}_$seed.json"
+      [ -e "$result" ] || $BIN/latentsafe eval-world-model --policy.path="$OUT/final_${type}_$seed" \
+        --dataset.repo_id="latentsafe/held_${held}_cache" --dataset.root="$DATA/held_${held}_tokens" --json="$result"
+    done
+  done
+done
+[ "$UNTIL" != filter ] || exit 0
 
 for kind in weak strong; do
   [ -e "$OUT/diffusion_$kind" ] || $BIN/python scripts/train_seeing_policy.py --dataset="$DATA/bag_$kind" \
@@ -98,8 +125,7 @@ done
 
 # The experiments: 6 CPU-seconds an episode of an operator, 11 to 17 of a policy, which is longer. Committed weights have
 # names; bag is a final_0.
-filters=$(for seed in $SEEDS; do echo "$OUT/final_$seed"; done)
-$BIN/python scripts/bag_operators.py --filters $filters --operators closed_end open_end --workers=2
-$BIN/python scripts/bag_policies.py --weak="$OUT/diffusion_weak" --strong="$OUT/diffusion_strong" --filters $filters \
+$BIN/python scripts/bag_operators.py --filters "${filters[@]}" --operators closed_end open_end --workers=2
+$BIN/python scripts/bag_policies.py --weak="$OUT/diffusion_weak" --strong="$OUT/diffusion_strong" --filters "${filters[@]}" \
   --workers=2
-$BIN/python scripts/bag_out_of_distribution.py --filters $filters --workers=2
+$BIN/python scripts/bag_out_of_distribution.py --filters "${filters[@]}" --workers=2

@@ -77,7 +77,7 @@ class DinoWMConfig(WorldModelConfig):
     frame_skip: int = 3
     history: int = 3
     dim: int = 128
-    depth: int = 2
+    depth: int = 1
     heads: int = 4
     head_dim: int = 32
     mlp: int = 256
