@@ -1,5 +1,6 @@
 """A filter of the bag that sees by an encoder of one's choice, from nothing: by the commands that users type."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -9,7 +10,7 @@ from lerobot_latentsafe.experiments.demo import Demo
 SOURCES = ("bag_mix", "bag_branches", "bag_lifts")
 """What is recorded; see `collection/franka.py`."""
 FEW = ("--batch_size=32", "--policy.margin.clips=2000", "--policy.reachability.pool=32768")
-"""What of configs/bag_dino_wm.yaml takes long where a frame has 64 tokens."""
+"""What of configs/bag_dino_wm.yaml takes long where a frame has many tokens."""
 
 
 @dataclass(frozen=True)
@@ -19,16 +20,20 @@ class FilterSizes:
     Attributes:
         episodes: of each source.
         image_size: pixels; None: the encoder's default.
+        merge_patches: so many a side are one token.
         steps, critic_steps: gradient steps of the world model, and of the critic.
     """
 
     episodes: int = 20
     image_size: int | None = None
+    merge_patches: int = 1
     steps: int = 400
     critic_steps: int = 2000
 
     def fitting(self, encoder: str) -> Self:
-        """With an encoder's image size, if none is given; what is not in the Hub's cache yet is downloaded.
+        """With an encoder's image size, if none is given, and tokens as large as 2 x 2 of them or more fill an image.
+
+        What is not in the Hub's cache yet is downloaded.
 
         Raises:
             EncoderError: the encoder cannot be had.
@@ -36,8 +41,9 @@ class FilterSizes:
         """
         found = load_encoder(encoder)
         size = found.image_size if self.image_size is None else self.image_size
-        found.n_patches(size, size)
-        return replace(self, image_size=size)
+        side = math.isqrt(found.n_patches(size, size))
+        merge = max(m for m in range(1, 5) if side % m == 0 and (side >= 2 * m or m == 1))
+        return replace(self, image_size=size, merge_patches=merge)
 
 
 def train_filter(demo: Demo, encoder: str, sizes: FilterSizes) -> str:
@@ -60,7 +66,8 @@ def train_filter(demo: Demo, encoder: str, sizes: FilterSizes) -> str:
     demo.run(
         f"world model: DINO-WM and a failure margin, {sizes.steps} steps",
         *("lerobot-train", "--config_path=configs/bag_dino_wm.yaml", *cached, f"--policy.frame_cache={cache}"),
-        *(f"--policy.world_model.image_size={size}", f"--steps={sizes.steps}", *FEW),
+        *(f"--policy.world_model.image_size={size}", f"--policy.world_model.merge_patches={sizes.merge_patches}"),
+        *(f"--steps={sizes.steps}", *FEW),
         *(f"--policy.scheduler_steps={sizes.steps}", f"--output_dir={demo.out}/world_model"),
     )
     trained = demo.out / "world_model" / "checkpoints" / "last" / "pretrained_model"
