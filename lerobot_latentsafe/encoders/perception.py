@@ -69,7 +69,10 @@ class PerceptionConfig:
 
 
 class FrameBasis(nn.Module):
-    """Principal components of the flattened tokens of a frame, on one scale: (..., P, C) -> (..., K)."""
+    """Principal components of the flattened tokens of a frame, on one scale: (..., P, C) -> (..., K).
+
+    The axes are orthogonal and of one length.
+    """
 
     mean: Tensor
     axes: Tensor
@@ -88,7 +91,7 @@ class FrameBasis(nn.Module):
 
     def lift(self, components: Tensor) -> Tensor:
         """Components of frames (..., K) -> the flattened tokens (..., P C) nearest to the mean that have them."""
-        return components @ (self.axes / self.axes.square().sum(0).clamp(min=1e-12)).T + self.mean  # orthogonal axes
+        return (components / self.axes[:, 0].square().sum().clamp(min=1e-12)) @ self.axes.T + self.mean
 
     def unsaid(self, tokens: Tensor) -> Tensor:
         """What its components leave unsaid of a frame's tokens (..., P, C)."""
@@ -128,7 +131,11 @@ class PatchBasis(nn.Module):
     def forward(self, tokens: Tensor) -> Tensor:
         """Whole tokens (..., P, cameras x C) -> their components (..., P, cameras x K)."""
         _require_fitted(self.fitted)
-        apart = tokens.unflatten(-1, (len(self.mean), -1)) - self.mean
+        return self.parts(tokens - self.mean.flatten())
+
+    def parts(self, differences: Tensor) -> Tensor:
+        """Components of differences of tokens (..., P, cameras x C)."""
+        apart = differences.unflatten(-1, (len(self.mean), -1))
         return torch.einsum("...nc,nck->...nk", apart, self.axes).flatten(-2)
 
     def lift(self, components: Tensor) -> Tensor:
@@ -228,6 +235,7 @@ class Perception(nn.Module):
         self.patches = PatchBasis(n_cameras, encoder.dim, n_kept) if n_kept else None
         # In a list, so that it is part of the world models that read class tokens, and of no others.
         self._class_scale = [ClassScale(n_cameras, encoder.dim) if encoder.has_class_token else None]
+        self._known: tuple[list, tuple[Tensor, Tensor] | None] = [], None
         self.token_dim = n_cameras * (n_kept or encoder.dim)
         self.sizes: dict[str, tuple[int, ...]] = {
             "tokens": (self.n_patches, self.token_dim),
@@ -335,4 +343,22 @@ class Perception(nn.Module):
     def cut_down(self, tokens: Tensor) -> Tensor:
         """Tokens (..., P, C), whole or cut down already, as they are kept."""
         whole = tokens.shape[-1] != self.token_dim
-        return self.patches(self.basis.unsaid(tokens)) if whole and self.patches is not None else tokens
+        if not whole or self.patches is None:
+            return tokens
+        weight, bias = self._said()
+        return self.patches(tokens) - (self.basis(tokens) @ weight + bias).view(*tokens.shape[:-1], -1)
+
+    def _said(self) -> tuple[Tensor, Tensor]:
+        """What the frame's components, times (K, D), and their mean (D,) tell of all components of its patches.
+
+        A tick would else lift each frame, which reads as many numbers as all its components have weights.
+        """
+        parts = self.basis.axes, self.basis.mean, self.patches.axes, self.patches.mean
+        state = [(part.data_ptr(), part._version) for part in parts]  # they are loaded, or moved, from time to time
+        if self._known[0] != state:
+            n_components = self.basis.axes.shape[1]
+            one_each = torch.eye(n_components, device=parts[0].device, dtype=parts[0].dtype)
+            lifted = self.basis.lift(torch.cat([torch.zeros_like(one_each[:1]), one_each]))
+            told = self.patches.parts(lifted.unflatten(-1, (self.n_patches, -1))).flatten(1)
+            self._known = state, (told[1:] - told[0], told[0])
+        return self._known[1]
