@@ -48,6 +48,7 @@ class BasePolicy:
     Attributes:
         planned: (B, N, A) in robot units, what comes after the action that was proposed last, of a chunk that was
             planned just then and can be read; else None.
+        coming: (B, N, A) in robot units, what comes after it, of a chunk of any age; None if that is not known.
 
     Raises:
         ValueError: it is itself a filter, or cannot choose one action at a time.
@@ -67,6 +68,7 @@ class BasePolicy:
         self._said_reset = False
         self._reads_plans = True
         self.planned: Tensor | None = None
+        self.coming: Tensor | None = None
 
     @classmethod
     def load(cls, path: str | Path, device: str = "cpu", ahead: int = 0) -> "BasePolicy":
@@ -106,7 +108,7 @@ class BasePolicy:
             self.chunks.reset()
         self.preprocessor.reset()
         self.postprocessor.reset()
-        self.planned = None
+        self.planned = self.coming = None
 
     def propose(self, observation: dict[str, Tensor]) -> Tensor:
         """Action (B, A) in robot units, through the base policy's own processors; see `planned` for what comes then."""
@@ -121,7 +123,13 @@ class BasePolicy:
             action = action.detach().clone().as_subclass(Tensor)
         queue = self._queue()
         self.planned = self._read(queue, action) if queue and len(queue) >= left else None
+        self.coming = self._still_to_come(len(queue or ())) if self.planned is None else self.planned
         return action
+
+    def _still_to_come(self, n: int) -> Tensor | None:
+        """What is left of a chunk that was read before, if it is the n actions that wait to be played."""
+        known = self.coming is not None and n > 0 and self.coming.shape[1] == n + 1
+        return self.coming[:, 1:] if known else None
 
     def _finished(self, action: Tensor) -> Tensor:
         """Actions (..., A) of the policy's own units in robot units, in the filter's order."""
@@ -155,6 +163,7 @@ class BasePolicy:
         A policy that remembers its actions, and says so by a method `was_overridden`, is told what was done instead:
         (B, A) in robot units.
         """
+        self.coming = None
         if hasattr(self.policy, "was_overridden"):
             theirs = inverse(self._action_order)
             return self.policy.was_overridden(executed if theirs is None else executed[:, theirs])

@@ -91,9 +91,21 @@ def test_what_is_planned_is_read_once_from_every_type_of_lerobot(kind):
     for tick in range(1, tiny_policies.PLAYED):
         proposed.append(base.propose(tiny_policies.seen(tick)))
         assert base.planned is None
+        left = planned[:, tick:]
+        assert torch.equal(base.coming, left) if left.shape[1] else base.coming is None
     assert torch.equal(planned, torch.stack(proposed[1:], 1))
     base.propose(tiny_policies.seen(tiny_policies.PLAYED))
-    assert base.planned is not None
+    assert base.planned is not None and base.coming is base.planned
+
+
+def test_what_was_to_come_is_forgotten_with_the_plan():
+    base = base_of(tiny_policies.counting("act"))
+    for forget in (base.reset, lambda: base.replan(torch.zeros(2, 2))):
+        base.reset()
+        base.propose(tiny_policies.seen(0))
+        assert base.coming is not None
+        forget()
+        assert base.coming is None
 
 
 def test_what_is_planned_ahead_is_read():
