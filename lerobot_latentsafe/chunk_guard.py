@@ -9,12 +9,15 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
 import torch
 from lerobot.processor import PolicyActionProcessorStep, ProcessorStepRegistry
 from torch import Tensor
 
 from lerobot_latentsafe.decision import Reason
 from lerobot_latentsafe.guard import check_plan
+from lerobot_latentsafe.host import on_host
+from lerobot_latentsafe.limits import Limits, differs
 from lerobot_latentsafe.runtime.checkpoint import read_config, resolve_checkpoint
 from lerobot_latentsafe.units import TrainedOn, Units
 
@@ -48,7 +51,7 @@ class ChunkGuardStep(PolicyActionProcessorStep):
         self.trained_on = TrainedOn(**trained_on) if isinstance(trained_on, dict) else trained_on
         if self.trained_on.action_low is None:
             raise ValueError("trained_on has no action_low: make it by latentsafe guard --dataset.repo_id=...")
-        self.on_fault, self.units = on_fault, Units(self.trained_on, [])
+        self.on_fault, self.limits = on_fault, Limits(self.trained_on, Units(self.trained_on, []))
         self.reset()
 
     @classmethod
@@ -58,8 +61,8 @@ class ChunkGuardStep(PolicyActionProcessorStep):
 
     def reset(self) -> None:
         """Start an episode."""
-        self._single: list[Tensor] = []
-        self._end: Tensor | None = None
+        self._single: list[np.ndarray] = []
+        self._end: np.ndarray | None = None
         self._said = False
 
     def action(self, action: Tensor) -> Tensor:
@@ -74,16 +77,16 @@ class ChunkGuardStep(PolicyActionProcessorStep):
         chunk = self._as_chunk(action)
         if action.dim() == 3:
             checked = self._check(chunk, [], self._end)
-            self._end = checked[:, -1].float()
+            self._end = on_host(checked[:, -1])
         else:
             before = [passed for passed in self._single if len(passed) == len(chunk)]
             checked = self._check(chunk, before, before[-1] if before else None)
-            self._single = [*before[-1:], checked[:, -1].float()]
+            self._single = [*before[-1:], on_host(checked[:, -1])]
         return checked.view(action.shape)
 
     def _as_chunk(self, action: Tensor) -> Tensor:
         chunk = action.view(1, 1, -1) if action.dim() == 1 else action[:, None] if action.dim() == 2 else action
-        names = self.units.action_names
+        names = self.limits.action_names
         if chunk.dim() != 3 or chunk.shape[-1] != len(names):
             raise UnsafeActionError(
                 f"the policy's actions have shape {tuple(action.shape)}, expected (robots, {len(names)}) or (robots, "
@@ -91,42 +94,44 @@ class ChunkGuardStep(PolicyActionProcessorStep):
             )
         return chunk
 
-    def _check(self, chunk: Tensor, before: list[Tensor], last: Tensor | None) -> Tensor:
+    def _check(self, chunk: Tensor, before: list[np.ndarray], last: np.ndarray | None) -> Tensor:
         """What of actions (B, N, A) is let through, and what holds from the first on that is not.
 
         Args:
             before, last: (B, A) that passed before them, to compare with, and to stay at.
         """
-        self.units = units = self.units.to(chunk.device)
-        fault = check_plan(units, chunk.float(), before)
-        good = chunk.float().clamp(units.action_low, units.action_high)
-        within = torch.where((good - chunk).abs() > 1e-5 * chunk.abs().clamp(min=1), good.to(chunk), chunk)
+        numbers = on_host(chunk)
+        fault = check_plan(self.limits, numbers, before)
+        good = numbers.clip(self.limits.action_low, self.limits.action_high)
+        let_through, changed = good, differs(good, numbers)
         broken = (fault != Reason.PASSED).cumsum(1) > 0
-        if not broken.any():
-            return within
-        self._tell(fault)
-        if last is None or len(last) != len(chunk):
-            last = torch.full_like(good[:, 0], torch.nan)
-        return torch.where(broken[..., None], self._held(good, broken, last)[:, None].to(chunk), within)
+        if broken.any():
+            self._tell(fault)
+            if last is None or len(last) != len(chunk):
+                last = self.limits.unknown(len(chunk))
+            let_through = np.where(broken[..., None], self._held(good, broken, last)[:, None], good)
+            changed |= broken[..., None]
+        return torch.where(_like(changed, chunk), _like(let_through, chunk).to(chunk.dtype), chunk)
 
-    def _held(self, good: Tensor, broken: Tensor, last: Tensor) -> Tensor:
+    def _held(self, good: np.ndarray, broken: np.ndarray, last: np.ndarray) -> np.ndarray:
         """What holds each robot (B, A): at its last action before something broke, of this chunk or before."""
         n_good = (~broken).sum(1)
-        here = good[torch.arange(len(good)), (n_good - 1).clamp(min=0)]
-        told = torch.where((n_good > 0)[:, None], here, last)
-        unknown = torch.full((len(good), len(self.units.state_names)), torch.nan, device=good.device)
-        held = self.units.hold(unknown, told)
-        if not held.isfinite().all():
+        here = good[np.arange(len(good)), (n_good - 1).clip(min=0)]
+        told = np.where((n_good > 0)[:, None], here, last)
+        unknown = np.full((len(good), len(self.limits.state_names)), np.nan, np.float32)
+        held = self.limits.hold(unknown, told)
+        if not np.isfinite(held).all():
             raise UnsafeActionError(
                 "the policy's first action is far from the data, and nobody knows where the robot is: nothing is sent. "
                 "Start again, or shield the policy (latentsafe wrap), which sees the robot"
             )
         return held
 
-    def _tell(self, fault: Tensor) -> None:
+    def _tell(self, fault: np.ndarray) -> None:
         """Say what is wrong, once an episode; or raise."""
-        names = {Reason(number).name.lower().replace("_", " ") for number in fault.unique().tolist() if number}
-        what = f"the policy's actions are not let through: {', '.join(sorted(names))}, in step {_first(fault)}"
+        names = {Reason(number).name.lower().replace("_", " ") for number in np.unique(fault).tolist() if number}
+        first = int((fault != Reason.PASSED).any(0).argmax())
+        what = f"the policy's actions are not let through: {', '.join(sorted(names))}, in step {first}"
         if self.on_fault == "raise":
             raise UnsafeActionError(f"{what}. Nothing was sent")
         if not self._said:
@@ -143,5 +148,6 @@ class ChunkGuardStep(PolicyActionProcessorStep):
         return features
 
 
-def _first(fault: Tensor) -> int:
-    return int((fault != Reason.PASSED).any(0).nonzero()[0])
+def _like(numbers: np.ndarray, chunk: Tensor) -> Tensor:
+    """Numbers of the host where a chunk is."""
+    return torch.from_numpy(numbers).to(chunk.device)

@@ -1,10 +1,10 @@
 """Filter laws: given a value, decide whether a proposed action passes. Pure and batched."""
 
-import functools
 import math
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -184,7 +184,8 @@ class FilterDecision:
         unsafe: bool (B,), the law's verdict on the proposed action.
         intervened: bool (B,), whether `action` is the fallback's; never in monitor mode.
         reason: int64 (B,), a `Reason`.
-        heard: (B, A), the action that was judged, as the world model heard it; of faulty rows that is to stay.
+        heard: (B, A), the action that was judged, as the world model heard it; of faulty rows that is to stay. None
+            where there is none that hears, by the law of a guard.
     """
 
     action: Tensor
@@ -196,6 +197,13 @@ class FilterDecision:
     reason: Tensor
     heard: Tensor | None = None
 
+    def to(self, device: torch.device) -> "FilterDecision":
+        """The same, on a device."""
+        if self.action.device == device:
+            return self
+        numbers = {name: None if value is None else value.to(device) for name, value in vars(self).items()}
+        return FilterDecision(**numbers)
+
 
 class Overrides:
     """What the law's threshold and its retreat depend on: which of the last steps of B robots were overridden.
@@ -205,38 +213,37 @@ class Overrides:
         retreated: int64 (B,), steps of a retreat that goes on.
     """
 
-    def __init__(self, n: int, device: torch.device):
-        self.recent = torch.zeros(n, RECENT, dtype=torch.bool, device=device)
-        self.retreated = torch.zeros(n, dtype=torch.long, device=device)
+    def __init__(self, n: int):
+        self.recent, self.retreated = np.zeros((n, RECENT), bool), np.zeros(n, np.int64)
 
-    def threshold(self, law: LawConfig) -> Tensor:
+    def threshold(self, law: LawConfig) -> np.ndarray:
         """What V must exceed (B,): epsilon, and `resume_above` where the fallback acts. Infinite for the first
         `min_retreat_steps` steps of a retreat."""
-        threshold = torch.where(self.recent[:, -1], max(law.epsilon, law.resume_above), law.epsilon)
-        return torch.where((self.retreated > 0) & (self.retreated < law.min_retreat_steps), torch.inf, threshold)
+        threshold = np.where(self.recent[:, -1], np.float32(max(law.epsilon, law.resume_above)), law.epsilon)
+        return np.where((self.retreated > 0) & (self.retreated < law.min_retreat_steps), np.inf, threshold)
 
-    def retreats(self, law: LawConfig) -> Tensor:
+    def retreats(self, law: LawConfig) -> np.ndarray:
         """Whether an override now would be the retreat's: one goes on, or the critic's action has been tried: (B,)."""
         tried = self.recent.sum(1) >= law.retreat_after
-        return (self.retreated > 0) | tried if law.retreat else torch.zeros_like(tried)
+        return (self.retreated > 0) | tried if law.retreat else np.zeros_like(tried)
 
-    def after(self, acts: Tensor, retreats: Tensor) -> "Overrides":
+    def after(self, acts: np.ndarray, retreats: np.ndarray) -> "Overrides":
         """One step on: whether the filter acted, and whether an override is the retreat's, bool (B,)."""
-        new = Overrides(len(acts), acts.device)
-        new.recent = torch.cat([self.recent[:, 1:], acts[:, None]], 1)
+        new = Overrides(len(acts))
+        new.recent[:, :-1], new.recent[:, -1] = self.recent[:, 1:], acts
         new.retreated = (self.retreated + 1) * (acts & retreats)
         return new
 
 
 def least_restrictive(
-    proposed: Tensor,
-    fallback: Tensor,
-    value: Tensor,
-    margin: Tensor,
-    epsilon: float | Tensor,
-    fault: Tensor | None = None,
+    proposed: np.ndarray,
+    fallback: np.ndarray,
+    value: np.ndarray,
+    margin: np.ndarray,
+    epsilon: float | np.ndarray,
+    fault: np.ndarray | None = None,
     monitor: bool = False,
-    passing: Tensor | None = None,
+    passing: np.ndarray | None = None,
 ) -> FilterDecision:
     """The paper's law: pass the proposed action if V > epsilon at its predicted next latent, else fall back.
 
@@ -248,20 +255,23 @@ def least_restrictive(
         fault: (B,) a `Reason` for rows that must not pass whatever their value; 0 elsewhere.
         monitor: judge, but let every action through.
         passing: (B, A), what of the proposal is executed if it passes; by default all.
+
+    Returns:
+        The decision, on the host.
     """
-    reason = torch.where(value > epsilon, Reason.PASSED, Reason.UNSAFE_VALUE)
-    reason = torch.where(torch.isfinite(value), reason, Reason.VALUE_NOT_FINITE)
-    if fault is not None:
-        reason = torch.where(fault != Reason.PASSED, fault, reason)
-    unsafe = reason != Reason.PASSED
-    intervened = torch.zeros_like(unsafe) if monitor else unsafe
-    passing = proposed if monitor or passing is None else passing
-    action = torch.where(intervened[:, None], fallback, passing)
-    return FilterDecision(action, proposed, value, margin, unsafe, intervened, reason)
+    reason = np.where(value > epsilon, Reason.PASSED, Reason.UNSAFE_VALUE)
+    reason = np.where(np.isfinite(value), reason, Reason.VALUE_NOT_FINITE)
+    return _choose(
+        proposed, fallback, value, margin, reason if fault is None else or_else(fault, reason), monitor, passing
+    )
 
 
 def by_checks_alone(
-    proposed: Tensor, hold: Tensor, fault: Tensor, monitor: bool = False, passing: Tensor | None = None
+    proposed: np.ndarray,
+    hold: np.ndarray,
+    fault: np.ndarray,
+    monitor: bool = False,
+    passing: np.ndarray | None = None,
 ) -> FilterDecision:
     """The law of a guard: pass what has no fault, else stay. Nothing is known of V and l, which are NaN.
 
@@ -269,29 +279,30 @@ def by_checks_alone(
         proposed, hold, passing: (B, A) in robot units, see `least_restrictive`.
         fault: (B,), a `Reason`.
     """
-    harmless = torch.ones_like(fault, dtype=torch.float32)
-    decision = least_restrictive(proposed, hold, harmless, harmless, 0.0, fault, monitor, passing)
-    return replace(decision, value=harmless * torch.nan, margin=harmless * torch.nan)
+    unknown = np.full(len(fault), np.nan, np.float32)
+    return _choose(proposed, hold, unknown, unknown, fault, monitor, passing)
 
 
-def first_fault(fault: Tensor, where: Tensor, reason: Reason) -> Tensor:
-    """Set a reason on rows (B,) that have none yet."""
-    return torch.where((fault == Reason.PASSED) & where, int(reason), fault)
+def _choose(
+    proposed: np.ndarray, fallback: np.ndarray, value: np.ndarray, margin: np.ndarray, reason: np.ndarray,
+    monitor: bool, passing: np.ndarray | None,
+) -> FilterDecision:  # fmt: skip
+    """Pass what nothing is wrong with, else fall back."""
+    unsafe = reason != Reason.PASSED
+    intervened = np.zeros_like(unsafe) if monitor else unsafe
+    passing = proposed if monitor or passing is None else passing
+    action = np.where(intervened[:, None], fallback, passing)
+    return FilterDecision(*map(torch.from_numpy, (action, proposed, value, margin, unsafe, intervened, reason)))
 
 
-def or_else(fault: Tensor, found: Tensor | int) -> Tensor:
+def or_else(fault: np.ndarray, found: np.ndarray | int) -> np.ndarray:
     """The faults (B,), and of rows that have none what was found later: a `Reason` for each (B,), or for all."""
-    return torch.where(fault == Reason.PASSED, found, fault)
+    return np.where(fault == Reason.PASSED, found, fault)
 
 
-def first_of(found: dict[Reason, Tensor]) -> Tensor:
-    """The first reason that holds for each row, or PASSED: (B,) of bool (B,) for each reason, in order."""
-    rank, reasons = _ranked(tuple(found), next(iter(found.values())).device)
-    return reasons[(torch.stack([*found.values()], -1) * rank).amax(-1)]
-
-
-@functools.cache
-def _ranked(found: tuple[Reason, ...], device: torch.device) -> tuple[Tensor, Tensor]:
-    """(K,), the earlier the higher; and the reason of each rank (K + 1,)."""
-    rank = torch.arange(len(found), 0, -1, device=device)
-    return rank, torch.tensor([int(Reason.PASSED), *(int(reason) for reason in reversed(found))], device=device)
+def first_of(found: dict[Reason, np.ndarray]) -> np.ndarray:
+    """The first reason that holds for each row, or PASSED: int64 (B,) of bool (B,) for each reason, in order."""
+    first = np.zeros(next(iter(found.values())).shape, np.int64)
+    for reason in reversed(found):
+        first[found[reason]] = reason
+    return first

@@ -1,7 +1,8 @@
 """The guard: what is wrong with what robots show, and with what they are to do, by the data they were trained on.
 
 It needs no world model. Each rule has its place here: shape and scale, finite, in range, seen, in time; and where the
-answer is to stay, what that is. A shield is a guard with a world model.
+answer is to stay, what that is. A shield is a guard with a world model. Pictures are tensors, as the model takes them;
+all other numbers are NumPy's, on the host.
 """
 
 import copy
@@ -11,15 +12,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
 from lerobot_latentsafe.decision import Reason, first_of, or_else
+from lerobot_latentsafe.host import all_of, any_of, on_host
+from lerobot_latentsafe.limits import Limits, differs
 from lerobot_latentsafe.looks import SIDE, Cameras, Response
-from lerobot_latentsafe.pictures import check_proportions
+from lerobot_latentsafe.pictures import check_proportions, extremes, surely_colours
 from lerobot_latentsafe.safety_model import SafetyModel
-from lerobot_latentsafe.units import Units
 
 logger = logging.getLogger(__name__)
 
@@ -98,11 +101,11 @@ class Seen:
     """
 
     images: dict[str, Tensor]
-    state: Tensor
-    fault: Tensor
+    state: np.ndarray
+    fault: np.ndarray
 
 
-def check_plan(units: Units, plan: Tensor, before: Sequence[Tensor] = ()) -> Tensor:
+def check_plan(limits: Limits, plan: np.ndarray, before: Sequence[np.ndarray] = ()) -> np.ndarray:
     """What is wrong with each of the actions that are planned, as far as that can be told before they are due.
 
     Args:
@@ -112,14 +115,14 @@ def check_plan(units: Units, plan: Tensor, before: Sequence[Tensor] = ()) -> Ten
     Returns:
         (B, N), a `Reason` each.
     """
-    actions = torch.cat([*(action[:, None] for action in before), plan], 1)
-    leaps = torch.zeros(actions.shape[:2], dtype=torch.bool, device=plan.device)
-    leaps[:, 1:] |= units.leaps(actions[:, 1:], [actions[:, :-1]])
-    leaps[:, 2:] |= units.leaps(actions[:, 2:], [actions[:, :-2], actions[:, 1:-1]])
+    actions = np.concatenate([*(action[:, None] for action in before), plan], 1)
+    leaps = np.zeros(actions.shape[:2], bool)
+    leaps[:, 1:] |= limits.leaps(actions[:, 1:], [actions[:, :-1]])
+    leaps[:, 2:] |= limits.leaps(actions[:, 2:], [actions[:, :-2], actions[:, 1:-1]])
     return first_of(
         {
-            Reason.ACTION_NOT_FINITE: ~plan.isfinite().all(-1),
-            Reason.ACTION_OUT_OF_RANGE: units.beyond(plan).any(-1),
+            Reason.ACTION_NOT_FINITE: ~all_of(np.isfinite(plan)),
+            Reason.ACTION_OUT_OF_RANGE: any_of(limits.beyond(plan)),
             Reason.ACTION_JUMPS: leaps[:, len(before) :],
         }
     )
@@ -136,15 +139,18 @@ class Guard:
         moving: bool (B, A), whether what each target is of has moved since the last tick; None without targets.
         stay: (B, A) in robot units, what would have been to stay at the last tick.
         holding: bool (B, A), commands that were told to stay.
+        inputs: keys of an observation that are read.
         begun: whether an observation of this robot has been seen, so that a foreign one is a fault and no mistake of
             whoever set it up.
     """
 
     def __init__(self, model: SafetyModel):
-        self.model, units = model, model.units
+        self.model, self.limits, limits = model, model.limits, model.limits
         self.cameras = Cameras(model.world_model.image_keys, model.config.trained_on.looks)
-        self.response = Response(units.rest, units.adds_up, units.furthest_unanswered)
-        self.begun, self._rows = False, 1
+        self.response = Response(limits.rest, limits.adds_up, limits.furthest_unanswered)
+        # What is averaged for the model serves the cameras, too, if its size is a multiple of theirs.
+        self._whole = model.config.world_model.image_size % SIDE == 0
+        self.inputs, self.begun, self._rows = model.inputs, False, 1
         self._said: set[tuple[str, str]] = set()
         self.reset()
 
@@ -152,14 +158,14 @@ class Guard:
         """Forget what was seen and told: call at the start of every episode."""
         self.cameras.reset()
         self.response.reset()
-        self.pose: Tensor | None = None
-        self.missed: Tensor | None = None
-        self.unwound: Tensor | None = None
-        self.told: Tensor | None = None
-        self.moving: Tensor | None = None
-        self.stay: Tensor | None = None
-        self.holding: Tensor | None = None
-        self._proposals: deque[Tensor] = deque(maxlen=2)
+        self.pose: np.ndarray | None = None
+        self.missed: np.ndarray | None = None
+        self.unwound: np.ndarray | None = None
+        self.told: np.ndarray | None = None
+        self.moving: np.ndarray | None = None
+        self.stay: np.ndarray | None = None
+        self.holding: np.ndarray | None = None
+        self._proposals: deque[np.ndarray] = deque(maxlen=2)
 
     def observe(self, observation: dict[str, Any]) -> Seen:
         """Check what the robots show, and remember their state.
@@ -184,19 +190,20 @@ class Guard:
             }
         )
         for reason in reversed(broken.values()):  # of all robots
-            fault = torch.full_like(fault, reason)
-        self.response.see(state, self.model.units.unknown(n) if self.told is None else self.told)
+            fault = np.full_like(fault, reason)
+        self.response.see(state, self.limits.unknown(n) if self.told is None else self.told)
         self.begun, self._rows = True, n
         return Seen(images, state, fault)
 
-    def _compare(self, pictures: dict[str, Tensor], images: dict[str, Tensor], state: Tensor) -> dict[Reason, Tensor]:
+    def _compare(
+        self, pictures: dict[str, Tensor], images: dict[str, Tensor], state: np.ndarray
+    ) -> dict[Reason, np.ndarray]:
         """What is wrong beside the data's pictures, and beside what was shown and told before: bool (B,) each."""
         if not pictures:
             return {}
         sides = {key: min(picture.shape[-2:]) for key, picture in pictures.items()}
-        whole = self.model.config.world_model.image_size % SIDE == 0  # then what is averaged once serves here, too
-        dead, unfamiliar, thumbnails = self.cameras.check(images if whole else pictures, sides)
-        old = self.cameras.repeats(thumbnails, self.model.units.normalise_state(state + self.unwound))
+        dead, unfamiliar, thumbnails = self.cameras.check(images if self._whole else pictures, sides)
+        old = self.cameras.repeats(thumbnails, self.limits.deviations(state + self.unwound))
         if (dead | unfamiliar).any():
             self.say_once("; ".join(self.cameras.wrong))
         return {
@@ -205,53 +212,50 @@ class Guard:
             Reason.OBSERVATION_STALE: old,
         }
 
-    def _see_state(self, given: dict[str, Any], n: int) -> tuple[Tensor, Tensor, Tensor]:
+    def _see_state(self, given: dict[str, Any], n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The usable numbers of the state (B, S), whether all are finite (B,), and whether all are believed (B,)."""
-        units, shape = self.model.units, (n, len(self.model.units.state_names))
-        if OBS_STATE in given and units.state_names:
-            state = self.model.state(given)
-            finite = torch.isfinite(state).all(-1)
+        limits, size = self.limits, (n, len(self.limits.state_names))
+        if OBS_STATE in given and limits.state_names:
+            state = on_host(given[OBS_STATE])
+            finite = all_of(np.isfinite(state))
         else:  # what is wrong is said already
-            state = torch.full(shape, torch.nan, device=self.model.device)
-            finite = torch.ones(n, dtype=torch.bool, device=self.model.device)
+            state, finite = np.full(size, np.nan, np.float32), np.ones(n, bool)
         if self.pose is None:
-            self.pose, self.missed = torch.full_like(state, torch.nan), torch.zeros_like(state)
-            self.unwound = torch.zeros_like(state)
-        usable = units.believable(state, self.pose, self.missed)
-        state = torch.where(usable, state, torch.nan)
-        if units.turns:
-            leap = state - self.pose
-            self.unwound = self.unwound - torch.where(leap.abs() > units.largest_leap, leap, 0.0)
-        self.moving = units.moves(state, self.pose) if units.has_targets else None
-        self.pose, self.missed = torch.where(usable, state, self.pose), (self.missed + 1) * ~usable
-        return state, finite, usable.all(-1)
+            self.pose = np.full_like(state, np.nan)
+            self.missed, self.unwound = np.zeros_like(state), np.zeros_like(state)
+        usable = limits.believable(state, self.pose, self.missed)
+        state = np.where(usable, state, np.nan)
+        self.unwound = self.unwound - limits.wrapped(state, self.pose)
+        self.moving = limits.moves(state, self.pose) if limits.has_targets else None
+        self.pose, self.missed = np.where(usable, state, self.pose), (self.missed + 1) * ~usable
+        return state, finite, all_of(usable)
 
-    def _see_pictures(self, given: dict[str, Any], n: int) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+    def _see_pictures(self, given: dict[str, Any], n: int) -> tuple[dict[str, Tensor], np.ndarray, np.ndarray]:
         """Pictures in [0, 1], whether what any camera shows are no colours (B,), and whether all are numbers (B,)."""
-        model, pictures, extremes = self.model, {}, []
-        for key in model.world_model.image_keys:
+        model, pictures = self.model, {}
+        for key in self.cameras.keys:
             if key in given:
                 pictures[key] = model.place(given[key])
-                extremes += [pictures[key].amin((1, 2, 3)), 1 - pictures[key].amax((1, 2, 3))]  # aminmax is slower
             else:  # that is said already
                 pictures[key] = torch.zeros(n, *model.config.input_features[key].shape, device=model.device)
-        if not extremes:
-            nothing = torch.zeros(n, dtype=torch.bool, device=model.device)
-            return pictures, nothing, ~nothing
-        least = torch.stack(extremes).unflatten(0, (-1, 2))  # NaN if anything is
-        numbers = least.isfinite().all(1)
-        colours = (least >= -COLOUR_TOLERANCE).all(1)
+        doubtful = [picture for picture in pictures.values() if not surely_colours(picture)]
+        if not doubtful:
+            return pictures, np.zeros(n, bool), np.ones(n, bool)
+        least, most = np.stack([extremes(picture) for picture in doubtful], 1)
+        numbers = np.isfinite(least) & np.isfinite(most)
+        colours = (least >= -COLOUR_TOLERANCE) & (1 - most >= -COLOUR_TOLERANCE)
         if not colours.all():
             pictures = {key: picture.nan_to_num(0.0).clamp(0, 1) for key, picture in pictures.items()}
-        return pictures, (numbers & ~colours).any(0), numbers.all(0)
+        return pictures, any_of(numbers & ~colours, 0), all_of(numbers, 0)
 
     def _check_shapes(self, observation: dict[str, Any]) -> tuple[int, dict[str, Reason]]:
         """The number of robots, and what is wrong with inputs that cannot be used at all."""
-        inputs = self.model.inputs
-        missing = [key for key in inputs if observation.get(key) is None]
-        wrong = {key: self._wrong_shape(key, observation[key]) for key in inputs if key not in missing}
+        missing = [key for key in self.inputs if observation.get(key) is None]
+        wrong = {key: self._wrong_shape(key, observation[key]) for key in self.inputs if key not in missing}
         rows = {key: len(observation[key]) for key, why in wrong.items() if why is None}
         n = len(self.pose) if self.pose is not None else next(iter(rows.values()), self._rows)
+        if not missing and all(count == n for count in rows.values()) and len(rows) == len(self.inputs):
+            return n, {}
         if self.pose is not None and rows and set(rows.values()).isdisjoint({n}):
             raise ValueError(
                 f"the batch went from {n} to {next(iter(rows.values()))} robots within an episode; "
@@ -275,7 +279,7 @@ class Guard:
         if not isinstance(value, Tensor) or not _holds_numbers(value):
             return f"{key} is {_kind(value)}, expected a tensor of numbers"
         if key == OBS_STATE:
-            size = len(self.model.units.state_names)
+            size = len(self.limits.state_names)
             fits = value.dim() == 2 and value.shape[1] == size
             return None if fits else f"{key} has shape {tuple(value.shape)}, expected (robots, {size})"
         if not value.is_floating_point() or value.dim() != 4 or not value.numel():
@@ -292,32 +296,31 @@ class Guard:
     def _lacks(self, missing: list[str], observation: dict[str, Any]) -> str:
         got = ", ".join(key for key in map(str, observation) if key.startswith("observation"))
         return (
-            f"observation lacks {', '.join(missing)}; this filter was trained on {', '.join(self.model.inputs)}. "
+            f"observation lacks {', '.join(missing)}; this filter was trained on {', '.join(self.inputs)}. "
             f"Got {got}. Rename the camera or state (--rename_map), or train a filter for this robot"
         )
 
     # -- what the robots are to do ---
 
     def check_action(
-        self, proposed: Any, fault: Tensor, hold: Tensor, missing_reason: Reason, planned: Tensor | None = None
-    ) -> tuple[Tensor, Tensor, Tensor]:
+        self, proposed: Any, fault: np.ndarray, hold: np.ndarray, missing_reason: Reason, planned: Any = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Faults, the proposal and what of it lies in the data's range: (B,), (B, A), (B, A) in robot units.
 
         Args:
-            planned: (B, N, A) in robot units, what is to come after the proposal, if that is known.
+            proposed: a tensor (B, A) in robot units, or None.
+            planned: a tensor (B, N, A) in robot units, what is to come after the proposal, if that is known.
         """
-        units = self.model.units
         if proposed is not None and not self._is_action(proposed, hold):
             proposed, missing_reason = None, Reason.BASE_POLICY_FAILED
         if planned is not None and not self._is_plan(planned, hold):
             proposed = planned = None
             missing_reason = Reason.BASE_POLICY_FAILED
         if proposed is None:
-            fault = or_else(fault, int(missing_reason))
-            proposed = hold
-        proposed = self.model.place(proposed).float()
-        finite = torch.isfinite(proposed).all(-1)
-        clipped, out_of_range = units.clip(torch.where(finite[:, None], proposed, hold), self.pose)
+            fault = or_else(fault, missing_reason)
+        wanted = hold if proposed is None else on_host(proposed)
+        finite = all_of(np.isfinite(wanted))
+        clipped, out_of_range = self.limits.clip(np.where(finite[:, None], wanted, hold), self.pose)
         mute = self.response.is_missing(clipped)
         if mute.any():
             self.say_once("the state stays as it is, whatever is sent: the robot goes no further until it changes")
@@ -325,30 +328,32 @@ class Guard:
             {
                 Reason.ACTION_NOT_FINITE: ~finite,
                 Reason.ACTION_OUT_OF_RANGE: out_of_range,
-                Reason.ACTION_JUMPS: units.leaps(clipped, self._proposals),
+                Reason.ACTION_JUMPS: self.limits.leaps(clipped, self._proposals),
                 Reason.OBSERVATION_STALE: mute,
             }
         )
         fault = or_else(fault, found)
         if planned is not None:
-            plan = torch.cat([clipped[:, None], self.model.place(planned).float()], 1)
-            coming = check_plan(units, plan)[:, 1:]
-            order = (Reason.ACTION_NOT_FINITE, Reason.ACTION_OUT_OF_RANGE, Reason.ACTION_JUMPS)
-            found = first_of({reason: (coming == reason).any(1) for reason in order})
-            fault = or_else(fault, found)
+            fault = or_else(fault, self._check_coming(clipped, on_host(planned)))
         self._proposals.append(clipped)
-        return fault, proposed, self._tell_clipped(proposed, clipped, fault)
+        return fault, wanted, self._tell_clipped(wanted, clipped, fault)
 
-    def _is_action(self, proposed: Any, hold: Tensor) -> bool:
+    def _check_coming(self, clipped: np.ndarray, planned: np.ndarray) -> np.ndarray:
+        """The first thing that is wrong with any action that is planned to come (B, N, A) after one (B, A): (B,)."""
+        coming = check_plan(self.limits, np.concatenate([clipped[:, None], planned], 1))[:, 1:]
+        order = (Reason.ACTION_NOT_FINITE, Reason.ACTION_OUT_OF_RANGE, Reason.ACTION_JUMPS)
+        return first_of({reason: any_of(coming == reason) for reason in order})
+
+    def _is_action(self, proposed: Any, hold: np.ndarray) -> bool:
         if isinstance(proposed, Tensor) and _holds_numbers(proposed) and proposed.shape == hold.shape:
             return True
         self.say_once(
             f"proposed action is {_kind(proposed)}, expected a tensor of shape {tuple(hold.shape)}: "
-            f"{', '.join(self.model.units.action_names)}. The base policy must be of the filter's action space"
+            f"{', '.join(self.limits.action_names)}. The base policy must be of the filter's action space"
         )
         return False
 
-    def _is_plan(self, planned: Any, hold: Tensor) -> bool:
+    def _is_plan(self, planned: Any, hold: np.ndarray) -> bool:
         if isinstance(planned, Tensor) and _holds_numbers(planned):
             n, size = hold.shape
             if planned.dim() == 3 and planned.shape[0] == n and planned.shape[2] == size:
@@ -356,18 +361,17 @@ class Guard:
         self.say_once(f"the actions planned are {_kind(planned)}, expected one of (robots, actions, {hold.shape[1]})")
         return False
 
-    def _tell_clipped(self, proposed: Tensor, clipped: Tensor, fault: Tensor) -> Tensor:
+    def _tell_clipped(self, wanted: np.ndarray, clipped: np.ndarray, fault: np.ndarray) -> np.ndarray:
         """What is executed of proposals that pass; says so once where that is not the proposal itself."""
-        if torch.equal(clipped, proposed):
-            return proposed
-        passes = (fault == Reason.PASSED)[:, None]
-        beyond = passes & ((clipped - proposed).abs() > 1e-5 * proposed.abs().clamp(min=1))
+        if np.array_equal(clipped, wanted):
+            return wanted
+        beyond = (fault == Reason.PASSED)[:, None] & differs(clipped, wanted)
         if beyond.any():
-            names = ", ".join(name for name, any_row in zip(self.model.units.action_names, beyond.any(0)) if any_row)
+            names = ", ".join(name for name, any_row in zip(self.limits.action_names, beyond.any(0)) if any_row)
             self.say_once("the policy leaves the range of the data a little; what is executed is clipped", names)
-        return torch.where(beyond, clipped, proposed)  # others pass to the bit
+        return np.where(beyond, clipped, wanted)  # others pass to the bit
 
-    def hold(self, state: Tensor) -> Tensor:
+    def hold(self, state: np.ndarray) -> np.ndarray:
         """Stay: (B, A) in robot units.
 
         Args:
@@ -379,8 +383,8 @@ class Guard:
         settled = None
         if self.moving is not None:
             settled = ~self.moving if self.holding is None else ~self.moving | self.holding
-        hold = self.model.units.hold(state, self.told, settled)
-        if not hold.isfinite().all() and self.model.config.law.mode != "monitor":
+        hold = self.limits.hold(state, self.told, settled)
+        if not np.isfinite(hold).all() and self.model.config.law.mode != "monitor":
             raise UnknownPoseError(
                 "the first observation of the episode shows no usable state, and these commands are positions: nobody "
                 "knows where the robot is, so nothing is commanded. See to the robot's sensors, and start again"
@@ -388,12 +392,10 @@ class Guard:
         self.stay = hold
         return hold
 
-    def was_told(self, action: Tensor) -> None:
+    def was_told(self, action: np.ndarray) -> None:
         """Remember (B, A) in robot units as what the robots were told."""
         self.told = action
-        self.holding = None
-        if self.stay is not None:  # isclose is slower
-            self.holding = (action - self.stay).abs() <= 1e-8 + 1e-5 * self.stay.abs()
+        self.holding = None if self.stay is None else np.abs(action - self.stay) <= 1e-8 + 1e-5 * np.abs(self.stay)
 
     def adopt(self, other: "Guard") -> None:
         """Take over what another guard remembers of the same robots."""

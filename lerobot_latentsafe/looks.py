@@ -8,13 +8,13 @@ apart is not tested.
 """
 
 import copy
-import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-import torch
+import numpy as np
 from torch import Tensor
 
+from lerobot_latentsafe.host import QUIET, any_of, on_host
 from lerobot_latentsafe.pictures import averaged
 
 SIDE, THUMBNAIL, COARSE = 32, 16, 8
@@ -35,14 +35,14 @@ by one of which it is known."""
 UNSEEN_FACTOR = 2.5
 """Times what the dataset shows to change unseen, beyond which a picture that stays the same is an old one."""
 
-ALTERATIONS: dict[str, Callable[[Tensor], Tensor]] = {
-    "upside down": lambda x: x.flip(-2, -1),
-    "mirrored": lambda x: x.flip(-1),
-    "flipped": lambda x: x.flip(-2),
-    "turned left": lambda x: x.rot90(1, (-2, -1)),
-    "turned right": lambda x: x.rot90(-1, (-2, -1)),
-    "with red and blue exchanged": lambda x: x.flip(-3),
-    "without colour": lambda x: x.mean(-3, keepdim=True).expand_as(x),
+ALTERATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "upside down": lambda x: x[..., ::-1, ::-1],
+    "mirrored": lambda x: x[..., ::-1],
+    "flipped": lambda x: x[..., ::-1, :],
+    "turned left": lambda x: np.rot90(x, 1, (-2, -1)),
+    "turned right": lambda x: np.rot90(x, -1, (-2, -1)),
+    "with red and blue exchanged": lambda x: x[..., ::-1, :, :],
+    "without colour": lambda x: np.broadcast_to(x.mean(-3, keepdims=True), x.shape),
 }
 """Name -> what it makes of pictures (..., 3, H, W)."""
 
@@ -71,40 +71,40 @@ class Look:
     frames: int = 0
 
 
-def shrink(pictures: Tensor) -> Tensor:
-    """Pictures (B, C, H, W), grey or of three colours, averaged to (B, 3, SIDE, SIDE)."""
-    small = averaged(pictures, SIDE)
-    return small if small.shape[1] == 3 else small.expand(-1, 3, -1, -1)
+def shrink(pictures: Tensor) -> np.ndarray:
+    """Pictures (B, C, H, W), grey or of three colours, averaged to (B, 3, SIDE, SIDE), on the host."""
+    small = on_host(averaged(pictures, SIDE))
+    return small if small.shape[1] == 3 else small.repeat(3, 1)
 
 
-def thumbnails(small: Tensor) -> Tensor:
-    """Pictures (..., SIDE, SIDE) averaged to (..., THUMBNAIL, THUMBNAIL)."""
-    return averaged(small, THUMBNAIL)
+def halved(pictures: np.ndarray) -> np.ndarray:
+    """Pictures (..., H, W) averaged to half the size: of SIDE, thumbnails; and of THUMBNAIL, those of COARSE pixels."""
+    lines = pictures[..., ::2, :] + pictures[..., 1::2, :]
+    return (lines[..., ::2] + lines[..., 1::2]) / 4
 
 
-def coarse(thumbnail: Tensor) -> Tensor:
-    """Thumbnails averaged to (..., COARSE, COARSE)."""
-    return averaged(thumbnail, COARSE)
-
-
-def detail(small: Tensor) -> Tensor:
+def detail(small: np.ndarray) -> np.ndarray:
     """Mean difference of neighbouring pixels of pictures (..., 3, SIDE, SIDE): (...,)."""
-    return (small[..., ::2, ::2] - small[..., 1::2, 1::2]).abs().mean((-3, -2, -1))
+    apart = np.abs(small[..., ::2, ::2] - small[..., 1::2, 1::2])
+    return apart.reshape(*small.shape[:-3], -1).sum(-1) / (3 * THUMBNAIL**2)
 
 
-def contrast(picture: Tensor) -> Tensor:
-    """Mean deviation of pictures (..., 3, H, W) from each half's mean colour; the same of both halves: (..., 3)."""
-    deviate, average = (weights.to(picture) for weights in _of_halves(picture.shape[-2] * picture.shape[-1]))
-    return (picture.flatten(-2) @ deviate).abs().flatten(-2) @ average
+def contrast(picture: np.ndarray) -> np.ndarray:
+    """Mean deviation of pictures (..., 3, COARSE, COARSE) from each half's mean colour; the same of both halves:
+    (..., 3)."""
+    deviation = np.abs(picture.reshape(*picture.shape[:-2], -1) @ _DEVIATE)
+    return deviation.reshape(*picture.shape[:-3], -1) @ _AVERAGE
 
 
-@functools.cache
-def _of_halves(n: int) -> tuple[Tensor, Tensor]:
+def _of_halves(n: int) -> tuple[np.ndarray, np.ndarray]:
     """What takes the mean of its half out of each of n pixels (n, n); what averages those of three colours over the
     whole and over each half (3 n, 3)."""
-    halves = torch.eye(2).repeat_interleave(n // 2, 0)  # (n, 2)
-    average = torch.cat([torch.full((n, 1), 1 / n), halves * 2 / n], 1).repeat(3, 1) / 3
-    return torch.eye(n) - halves @ halves.T * 2 / n, average
+    halves = np.eye(2, dtype=np.float32).repeat(n // 2, 0)  # (n, 2)
+    average = np.concatenate([halves.mean(1, keepdims=True), halves], 1) * 2 / n
+    return np.eye(n, dtype=np.float32) - halves @ halves.T * 2 / n, np.tile(average, (3, 1)) / 3
+
+
+_DEVIATE, _AVERAGE = _of_halves(COARSE**2)
 
 
 class Stream:
@@ -120,9 +120,9 @@ class Stream:
 
     def reset(self) -> None:
         """Forget them."""
-        self._shown: Tensor | None = None
+        self._shown: np.ndarray | None = None
 
-    def went_unseen(self, thumbnail: Tensor, state: Tensor) -> Tensor:
+    def went_unseen(self, thumbnail: np.ndarray, state: np.ndarray) -> np.ndarray:
         """How far each number of the state is from where it was when a camera first showed what it shows now.
 
         Args:
@@ -132,19 +132,24 @@ class Stream:
         Returns:
             (B, C, S); zero for a camera that shows something new.
         """
-        shown = thumbnail.flatten(2)[:, :, None]
+        size = n, n_cameras = thumbnail.shape[:2]
+        shown = thumbnail.reshape(n, n_cameras, -1)
         if self._shown is None:
-            self._shown = shown.new_full((*shown.shape[:2], KEPT, shown.shape[3]), torch.inf)
-            self._states = state.new_zeros(*shown.shape[:2], KEPT, state.shape[1])
-        state = state[:, None, None]
-        same = (self._shown - shown).abs().amax(-1) <= self.same
-        apart = (self._states - state).abs().nan_to_num(0.0)
-        new = (~same.any(-1) & shown[:, :, 0].isfinite().all(-1))[..., None, None]
-        if new.any():  # the oldest goes
-            state = state.expand(-1, shown.shape[1], -1, -1)
-            self._shown = torch.where(new, torch.cat([self._shown[:, :, 1:], shown], 2), self._shown)
-            self._states = torch.where(new, torch.cat([self._states[:, :, 1:], state], 2), self._states)
-        return (apart * same[..., None]).amax(2)
+            self._shown = np.full((*size, KEPT, shown.shape[-1]), np.inf, np.float32)
+            self._states = np.zeros((*size, KEPT, state.shape[-1]), np.float32)
+            self._oldest = np.zeros(size, np.int64)
+        apart = self._shown - shown[:, :, None]
+        same = np.abs(apart, out=apart).max(-1) <= self.same
+        again = any_of(same)
+        went = np.zeros((*size, state.shape[-1]), np.float32)
+        if again.any():
+            moved = np.abs(self._states - state[:, None, None])
+            went = np.where(same[..., None] & ~np.isnan(moved), moved, 0.0).max(2)
+        new = np.nonzero(~again & np.isfinite(shown).all(-1))
+        place = (*new, self._oldest[new])
+        self._shown[place], self._states[place] = shown[new], state[new[0]]
+        self._oldest[new] = (self._oldest[new] + 1) % KEPT
+        return went
 
 
 class Response:
@@ -156,15 +161,15 @@ class Response:
         limit: (A,), how far each may go unanswered, robot units.
     """
 
-    def __init__(self, rest: Tensor, adds_up: Tensor, limit: Tensor | float = torch.inf):
-        self.rest, self.adds_up, self.limit = rest, adds_up, torch.as_tensor(limit)
+    def __init__(self, rest: np.ndarray, adds_up: np.ndarray, limit: np.ndarray | float = np.inf):
+        self.rest, self.adds_up, self.limit = rest, adds_up, limit
         self.reset()
 
-    def see(self, state: Tensor, sent: Tensor) -> None:
+    def see(self, state: np.ndarray, sent: np.ndarray) -> None:
         """Note the state of a tick, and what was executed before it; see `unanswered`."""
         self._went = self.unanswered(state, sent)
 
-    def is_missing(self, proposed: Tensor) -> Tensor:
+    def is_missing(self, proposed: np.ndarray) -> np.ndarray:
         """Which robots do not answer, and would be led further from where they were seen: bool (B,).
 
         What leads back passes, so that a robot that stands at its limits does not stand there for ever; and one whose
@@ -175,16 +180,17 @@ class Response:
         """
         far = self._went > self.limit
         if not far.any():
-            return far.any(-1)
-        place = torch.where(self.adds_up, self._sum + proposed, proposed)
-        back = (place - self._begin).abs() < self._went
-        return (far & ~back).any(-1)
+            return any_of(far)
+        place = np.where(self.adds_up, self._sum + proposed, proposed)
+        back = np.abs(place - self._begin) < self._went
+        return any_of(far & ~back)
 
     def reset(self) -> None:
         """Start an episode."""
-        self._since: Tensor | None = None
+        self._since: np.ndarray | None = None
 
-    def unanswered(self, state: Tensor, sent: Tensor) -> Tensor:
+    @QUIET
+    def unanswered(self, state: np.ndarray, sent: np.ndarray) -> np.ndarray:
         """How far each command went while no number of the state changed: (B, A) in robot units.
 
         Args:
@@ -192,16 +198,14 @@ class Response:
             sent: (B, A), what was executed before it; NaN at the start of an episode.
         """
         if self._since is None:
-            self.rest, self.adds_up, self.limit = (
-                numbers.to(state.device) for numbers in (self.rest, self.adds_up, self.limit)
-            )
-            self._since, self._begin, self._sum = state, sent, torch.zeros_like(sent)
-        self._sum = self._sum + torch.where(self.adds_up, sent.nan_to_num(0.0), 0.0)
-        place = torch.where(self.adds_up, self._sum, sent)
-        changed = ((state - self._since).abs() > self.rest).any(-1, keepdim=True)
-        self._since = torch.where(changed, state, self._since)
-        self._begin = torch.where(changed | self._begin.isnan(), place, self._begin)
-        return (place - self._begin).abs().nan_to_num(0.0)
+            self._since, self._begin, self._sum = state, sent, np.zeros_like(sent)
+        self._sum = self._sum + np.where(self.adds_up & ~np.isnan(sent), sent, 0.0)
+        place = np.where(self.adds_up, self._sum, sent)
+        changed = any_of(np.abs(state - self._since) > self.rest)[:, None]
+        self._since = np.where(changed, state, self._since)
+        self._begin = np.where(changed | np.isnan(self._begin), place, self._begin)
+        went = np.abs(place - self._begin)
+        return np.where(np.isnan(went), 0.0, went)
 
 
 class Cameras:
@@ -214,31 +218,35 @@ class Cameras:
 
     def __init__(self, keys: list[str], looks: dict[str, Look] | None = None):
         looks = looks or {}
-        self.keys, self.known = list(keys), [key in looks for key in keys]
+        self.keys = list(keys)
         each = [looks.get(key, Look()) for key in keys]
         self._sees = [[*look.told] for look in each]
-        least = torch.tensor([look.contrast or [0.0] * 3 for look in each]).view(-1, 3) / FACTOR
-        self._least = torch.where(least > NOTHING, least, 0.0)  # a half that may be even is not judged
-        self._least[:, 0].clamp_(min=NOTHING)
-        finest = [look.detail or [0.0, torch.inf] for look in each]
-        self._finest = torch.tensor([[low / FACTOR, high * FACTOR] for low, high in finest]).view(-1, 2)
+        least = np.array([look.contrast or [0.0] * 3 for look in each], np.float32).reshape(-1, 3) / FACTOR
+        self._least = np.where(least > NOTHING, least, 0.0)  # a half that may be even is not judged
+        self._least[:, 0] = self._least[:, 0].clip(min=NOTHING)
+        finest = [look.detail or [0.0, np.inf] for look in each]
+        self._finest = np.array([[low / FACTOR, high * FACTOR] for low, high in finest], np.float32).reshape(-1, 2)
         self._sizes = [SIDE if look.detail else 0 for look in each]
         nowhere = [0.0] * (3 * COARSE**2)
-        mean = torch.tensor([look.mean or nowhere for look in each]).view(-1, 3, COARSE, COARSE)
-        furthest = torch.tensor([FACTOR * look.furthest if look.mean else torch.inf for look in each])
+        mean = np.array([look.mean or nowhere for look in each], np.float32).reshape(-1, 3, COARSE, COARSE)
+        furthest = np.array([FACTOR * look.furthest if look.mean else np.inf for look in each], np.float32)
         self._weight, self._limit = _templates(mean, furthest, keys, self._sees)
-        unseen = [UNSEEN_FACTOR * torch.tensor(look.unseen) + MOVED_UNSEEN if look.unseen else None for look in each]
-        self._unseen = None if None in unseen else torch.stack(unseen)
-        self._stream = Stream(SAME if self._unseen is not None else 0.0)
+        known = bool(each) and all(look.unseen for look in each)
+        self._allowed: np.ndarray | float = MOVED
+        if known:
+            self._allowed = UNSEEN_FACTOR * np.array([look.unseen for look in each], np.float32) + MOVED_UNSEEN
+        self._stream = Stream(SAME if known else 0.0)
         self.reset()
 
     def reset(self) -> None:
         """Start an episode."""
         self._stream.reset()
-        self._repeats: Tensor | int = 0
-        self._checked: tuple[Tensor, ...] = ()
+        self._repeats = np.zeros((1, 1), np.int64)
+        self._checked: tuple[np.ndarray, ...] = ()
 
-    def check(self, pictures: dict[str, Tensor], sides: dict[str, int] | None = None) -> tuple[Tensor, Tensor, Tensor]:
+    def check(
+        self, pictures: dict[str, Tensor], sides: dict[str, int] | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Which robots have a camera that shows nothing, and which one that shows what the dataset never does.
 
         Args:
@@ -248,55 +256,39 @@ class Cameras:
         Returns:
             dead, unfamiliar: bool (B,); and thumbnails (B, cameras, 3, THUMBNAIL, THUMBNAIL) for `repeats`.
         """
-        small = self._shrunk([pictures[key] for key in self.keys])
-        self._move_to(small.device)
-        thumbnail = thumbnails(small)
-        picture = coarse(thumbnail)
-        dead = (contrast(picture) < self._least).any(-1)
+        small = np.stack([shrink(pictures[key]) for key in self.keys], 1)
+        thumbnail = halved(small)
+        picture = halved(thumbnail)
+        dead = any_of(contrast(picture) < self._least)
         fine = detail(small)
         blurred = fine < self._finest[:, 0]
         sides = sides or {key: min(picture.shape[-2:]) for key, picture in pictures.items()}
         tiny = [sides[key] < size for key, size in zip(self.keys, self._sizes)]
         if any(tiny):
-            blurred = blurred | torch.tensor(tiny, device=small.device)
-        pixels = picture.flatten(2)
-        score = (self._weight @ pixels[..., None]).squeeze(-1)  # (B, C, 1 + N), see _templates
-        score[..., 0] += pixels.square().sum(-1)
+            blurred |= tiny
+        pixels = picture.reshape(*picture.shape[:2], -1)
+        score = (self._weight @ pixels[..., None])[..., 0]  # (B, C, 1 + N), see _templates
+        score[..., 0] += (pixels * pixels).sum(-1)
         beyond = score > self._limit
         strange = blurred | (fine > self._finest[:, 1]) | beyond[..., 0]
         altered = beyond[..., 1:]
         self._checked = dead, blurred, strange, altered
-        return dead.any(1), (strange | altered.any(-1)).any(1), thumbnail
+        return any_of(dead), any_of(strange | any_of(altered)), thumbnail
 
-    def _shrunk(self, pictures: list[Tensor]) -> Tensor:
-        """Pictures (B, C, H, W) of each camera, averaged: (B, cameras, 3, SIDE, SIDE)."""
-        if len({picture.shape for picture in pictures}) == 1 and pictures[0].shape[1] == 3:  # all in one go
-            return shrink(torch.stack(pictures, 1).flatten(0, 1)).unflatten(0, (-1, len(pictures)))
-        return torch.stack([shrink(picture) for picture in pictures], 1)
-
-    def _move_to(self, device: torch.device) -> None:
-        """Have all thresholds where the pictures are."""
-        if self._least.device != device:
-            for name in ("_least", "_finest", "_weight", "_limit", "_unseen"):
-                known = getattr(self, name)
-                setattr(self, name, None if known is None else known.to(device))
-
-    def repeats(self, thumbnail: Tensor, state: Tensor) -> Tensor:
+    def repeats(self, thumbnail: np.ndarray, state: np.ndarray) -> np.ndarray:
         """Which robots have a camera that shows an old picture, though they moved: frozen, or going round and round.
 
         Args:
             thumbnail: of `check`.
             state: (B, S), standard deviations; numbers that are not usable are NaN.
         """
-        went = self._stream.went_unseen(thumbnail, state)
-        allowed = MOVED if self._unseen is None else self._unseen
-        old = (went > allowed).any(-1)
+        old = any_of(self._stream.went_unseen(thumbnail, state) > self._allowed)
         self._repeats = (self._repeats + 1) * old
-        return (self._repeats >= REPEATS).any(1)
+        return any_of(self._repeats >= REPEATS)
 
     def adopt(self, other: "Cameras") -> None:
         """Take over what others remember of the same cameras."""
-        self._stream, self._repeats = copy.copy(other._stream), other._repeats
+        self._stream, self._repeats = copy.deepcopy(other._stream), other._repeats
 
     @property
     def wrong(self) -> list[str]:
@@ -304,7 +296,7 @@ class Cameras:
         said = []
         for c, key in enumerate(self.keys if self._checked else []):
             dead, blurred, strange, altered = (found[:, c] for found in self._checked)
-            seen = [name for name, any_row in zip(self._sees[c], altered.any(0).tolist()) if any_row]
+            seen = [name for name, any_row in zip(self._sees[c], any_of(altered, 0)) if any_row]
             if dead.any():
                 said.append(f"{key} shows nothing")
             elif seen:
@@ -316,7 +308,9 @@ class Cameras:
         return said
 
 
-def _templates(mean: Tensor, furthest: Tensor, keys: list[str], sees: list[list[str]]) -> tuple[Tensor, Tensor]:
+def _templates(
+    mean: np.ndarray, furthest: np.ndarray, keys: list[str], sees: list[list[str]]
+) -> tuple[np.ndarray, np.ndarray]:
     """Weights w (C, 1 + N, D) and limits (C, 1 + N) for a picture x (D,) of each of C cameras.
 
     x x + w_0 x exceeds its limit where |x - m|, root mean square, exceeds `furthest`; w_n x where x is on the side of
@@ -324,22 +318,30 @@ def _templates(mean: Tensor, furthest: Tensor, keys: list[str], sees: list[list[
     altered in the data. Rows beyond a camera's alterations never do.
     """
     most = 1 + max([len(names) for names in sees], default=0)
-    n_pixels = mean[0].numel() if len(mean) else 0
-    weight, limit = mean.new_zeros(len(mean), most, n_pixels), mean.new_full((len(mean), most), torch.inf)
+    n_pixels = mean[0].size if len(mean) else 0
+    weight = np.zeros((len(mean), most, n_pixels), np.float32)
+    limit = np.full((len(mean), most), np.inf, np.float32)
     for c, names in enumerate(sees):
-        weight[c, 0] = -2 * mean[c].flatten()
-        limit[c, 0] = n_pixels * furthest[c].square() - mean[c].square().sum()
+        weight[c, 0] = -2 * mean[c].ravel()
+        limit[c, 0] = n_pixels * furthest[c] ** 2 - _square(mean[c])
         for n, name in enumerate(names, 1):
             altered = ALTERATIONS[name](mean[c]) if name in ALTERATIONS else mean[keys.index(name)]
-            weight[c, n] = 2 * (altered - mean[c]).flatten()
-            limit[c, n] = altered.square().sum() - mean[c].square().sum() + APART * (altered - mean[c]).square().sum()
+            weight[c, n] = 2 * (altered - mean[c]).ravel()
+            limit[c, n] = _square(altered) - _square(mean[c]) + APART * _square(altered - mean[c])
     return weight, limit
+
+
+def _square(picture: np.ndarray) -> np.ndarray:
+    """The sum of squares of pictures (..., 3, H, W): (...,)."""
+    return (picture * picture).sum((-3, -2, -1))
 
 
 # -- learning ---
 
 
-def learn_looks(shown: dict[str, Tensor], fine: dict[str, Tensor], state: Tensor, episode: Tensor) -> dict[str, Look]:
+def learn_looks(
+    shown: dict[str, np.ndarray], fine: dict[str, np.ndarray], state: np.ndarray, episode: np.ndarray
+) -> dict[str, Look]:
     """What the cameras of a dataset look like.
 
     Args:
@@ -348,11 +350,11 @@ def learn_looks(shown: dict[str, Tensor], fine: dict[str, Tensor], state: Tensor
         state: (N, S), standard deviations.
         episode: (N,), the number of each frame's.
     """
-    pictures = {key: coarse(thumbnail) for key, thumbnail in shown.items()}
+    pictures = {key: halved(thumbnail) for key, thumbnail in shown.items()}
     healthy = {key: contrast(picture)[:, 0] >= NOTHING for key, picture in pictures.items()}
     pictures = {key: picture[healthy[key]] for key, picture in pictures.items()}
     means = {key: picture.mean(0) for key, picture in pictures.items() if len(picture)}
-    unseen = _went_unseen(torch.stack(list(shown.values()), 1), state, episode)
+    unseen = _went_unseen(np.stack(list(shown.values()), 1), state, episode)
     looks = {}
     for c, key in enumerate(shown):
         if key not in means:
@@ -362,9 +364,9 @@ def learn_looks(shown: dict[str, Tensor], fine: dict[str, Tensor], state: Tensor
         lines = fine[key][healthy[key]] if key in fine else None
         looks[key] = Look(
             mean=_rounded(mean),
-            furthest=round(float((picture - mean).square().mean((1, 2, 3)).sqrt().max()), 5),
-            contrast=_rounded(contrast(picture).amin(0)),
-            detail=[] if lines is None else _rounded(torch.stack([lines.min(), lines.max()])),
+            furthest=round(float(np.sqrt(_square(picture - mean) / mean.size).max()), 5),
+            contrast=_rounded(contrast(picture).min(0)),
+            detail=[] if lines is None else _rounded(np.array([lines.min(), lines.max()])),
             told=_told(picture, mean, others),
             unseen=_rounded(unseen[c]),
             frames=len(picture),
@@ -372,7 +374,7 @@ def learn_looks(shown: dict[str, Tensor], fine: dict[str, Tensor], state: Tensor
     return looks
 
 
-def _told(picture: Tensor, mean: Tensor, others: dict[str, tuple[Tensor, Tensor]]) -> list[str]:
+def _told(picture: np.ndarray, mean: np.ndarray, others: dict[str, tuple[np.ndarray, np.ndarray]]) -> list[str]:
     """Alterations that each of the pictures (N, 3, COARSE, COARSE) tells apart from what it is, and it from them."""
     altered = {name: (alter(mean), alter(picture)) for name, alter in ALTERATIONS.items()}
     return [
@@ -382,30 +384,29 @@ def _told(picture: Tensor, mean: Tensor, others: dict[str, tuple[Tensor, Tensor]
     ]
 
 
-def _side(picture: Tensor, mean: Tensor, other: Tensor) -> Tensor:
+def _side(picture: np.ndarray, mean: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Where pictures (N, 3, h, w) lie between one mean, at -1, and another, at 1: (N,)."""
     apart = other - mean
-    nearer = 2 * (picture * apart).sum((1, 2, 3)) + mean.square().sum() - other.square().sum()
-    return nearer / apart.square().sum().clamp(min=1e-9)
+    nearer = 2 * (picture * apart).sum((1, 2, 3)) + _square(mean) - _square(other)
+    return nearer / _square(apart).clip(min=1e-9)
 
 
-def _went_unseen(shown: Tensor, state: Tensor, episode: Tensor) -> Tensor:
+def _went_unseen(shown: np.ndarray, state: np.ndarray, episode: np.ndarray) -> np.ndarray:
     """The largest `went_unseen` of each camera and number of the state: (C, S)."""
-    most, stream = state.new_zeros(shown.shape[1], state.shape[1]), Stream()
+    most, stream = np.zeros((shown.shape[1], state.shape[1]), np.float32), Stream()
     for frames in by_tick(episode):
-        thumbnail = torch.where((frames >= 0)[:, None, None, None, None], shown[frames], torch.nan)
-        most = torch.maximum(most, stream.went_unseen(thumbnail, state[frames]).amax(0))
+        thumbnail = np.where((frames >= 0)[:, None, None, None, None], shown[frames], np.nan)
+        most = np.maximum(most, stream.went_unseen(thumbnail, state[frames]).max(0))
     return most
 
 
-def by_tick(episode: Tensor) -> Tensor:
+def by_tick(episode: np.ndarray) -> np.ndarray:
     """Frames that are the first, the second and so on of every episode (T, E); -1 after an episode's end."""
-    lengths = episode.unique_consecutive(return_counts=True)[1]
-    places = torch.full((int(lengths.max()), len(lengths)), -1)
-    for column, (begin, length) in enumerate(zip((lengths.cumsum(0) - lengths).tolist(), lengths.tolist())):
-        places[:length, column] = torch.arange(begin, begin + length)
-    return places
+    begins = np.flatnonzero(np.diff(episode, prepend=episode[0] - 1))
+    lengths = np.diff(begins, append=len(episode))
+    ticks = np.arange(lengths.max())[:, None]
+    return np.where(ticks < lengths, begins + ticks, -1)
 
 
-def _rounded(numbers: Tensor) -> list[float]:
-    return [round(number, 5) for number in numbers.flatten().tolist()]
+def _rounded(numbers: np.ndarray) -> list[float]:
+    return [round(number, 5) for number in numbers.ravel().tolist()]

@@ -25,6 +25,7 @@ from lerobot_latentsafe.datasets.clips import FilterData
 from lerobot_latentsafe.datasets.live_cameras import looks_of
 from lerobot_latentsafe.decision import FilterDecision, LawOptions, Reason
 from lerobot_latentsafe.guard import standing_still
+from lerobot_latentsafe.host import on_host
 from lerobot_latentsafe.model_card import make_model_card
 from lerobot_latentsafe.runtime.checkpoint import (
     BASE_FOLDER,
@@ -173,7 +174,7 @@ class LatentSafePolicy(PreTrainedPolicy):
                 "the success rate says nothing. Leave out --env.type, or give --env_eval_freq=0; train the critic with "
                 "latentsafe train-reachability, then measure with latentsafe eval-shield"
             )
-        return self.model.units.hold(self.model.state(batch))
+        return self.model.tensor(self.model.limits.hold(on_host(self.model.state(batch))))
 
     @torch.no_grad()
     def decide(self, batch: dict[str, Tensor], age_s: float = 0.0) -> FilterDecision:

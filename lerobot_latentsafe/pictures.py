@@ -2,8 +2,11 @@
 
 import functools
 
+import numpy as np
 import torch
 from torch import Tensor
+
+from lerobot_latentsafe.host import on_host
 
 
 def to_model_images(images: Tensor, size: int) -> Tensor:
@@ -37,6 +40,21 @@ def _averages(n: int, size: int) -> Tensor:
         first, end = i * n // size, -(-(i + 1) * n // size)
         weights[i, first:end] = 1 / (end - first)
     return weights
+
+
+def surely_colours(pictures: Tensor) -> bool:
+    """Whether all numbers are from 0 to 1, as far as that is told in one quick pass: on the host.
+
+    Read as integers, floats from 0 on keep their order, and what is negative or no number comes after 1.
+    """
+    return pictures.device.type == "cpu" and bool(
+        on_host(pictures).view(np.uint32).max() <= np.float32(1).view(np.uint32)
+    )
+
+
+def extremes(pictures: Tensor) -> np.ndarray:
+    """The least and the largest number of each of the pictures (B, C, H, W): (2, B); NaN of one that has any."""
+    return on_host(torch.stack([pictures.amin((1, 2, 3)), pictures.amax((1, 2, 3))]))
 
 
 def check_proportions(key: str, shape: tuple[int, ...], trained: tuple[int, ...]) -> None:

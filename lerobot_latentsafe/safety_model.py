@@ -8,6 +8,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import Any
 
+import numpy as np
 import torch
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor, nn
@@ -16,6 +17,7 @@ from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
 from lerobot_latentsafe.critic import BACKUPS, SafetyCritic, safety_bellman_target
 from lerobot_latentsafe.datasets.clips import Clip
 from lerobot_latentsafe.latent import Latent
+from lerobot_latentsafe.limits import Limits
 from lerobot_latentsafe.margin import FailureMargin, hinge_loss
 from lerobot_latentsafe.meanings import MeaningError
 from lerobot_latentsafe.pictures import to_model_images
@@ -71,6 +73,7 @@ class SafetyModel(nn.Module):
 
     Attributes:
         units: normalises and denormalises.
+        limits: of what the robot can show and may be told.
         world_model, margin, critic: the parts.
         lacks_weights: whether the configuration speaks of trained weights, and nothing was loaded or trained since.
 
@@ -88,6 +91,7 @@ class SafetyModel(nn.Module):
             )
         self.config = config
         self.units = Units(trained_on, config.fallback.frozen_commands)
+        self.limits = Limits(trained_on, self.units)
         sizes = len(trained_on.state_mean), len(trained_on.action_low) * config.world_model.frame_skip
         with warnings.catch_warnings():  # without proprioception some layers have no inputs
             warnings.filterwarnings("ignore", "Initializing zero-element tensors")
@@ -151,6 +155,10 @@ class SafetyModel(nn.Module):
     def place(self, numbers: Tensor) -> Tensor:
         """Numbers on this model's device; of 64-bit floats, which Apple's GPUs do not have, single ones."""
         return numbers.to(self.device, torch.float32) if numbers.is_floating_point() else numbers.to(self.device)
+
+    def tensor(self, numbers: np.ndarray) -> Tensor:
+        """Numbers of the host, on this model's device."""
+        return torch.from_numpy(numbers).to(self.device)
 
     @property
     def inputs(self) -> list[str]:

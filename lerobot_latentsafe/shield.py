@@ -14,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -23,10 +24,12 @@ from lerobot_latentsafe.decision import (
     Overrides,
     Reason,
     by_checks_alone,
-    first_fault,
+    first_of,
     least_restrictive,
+    or_else,
 )
 from lerobot_latentsafe.guard import UNSEEN, Guard, Pace, Seen
+from lerobot_latentsafe.host import on_host
 from lerobot_latentsafe.latent import Belief, Latent, is_sound, map_latent, replace_rows
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
 from lerobot_latentsafe.runtime.time_limit import TimeLimit
@@ -46,16 +49,16 @@ class Judgement(NamedTuple):
     """
 
     belief: Belief
-    value: Tensor
-    margin: Tensor
-    fallback: Tensor
-    retreats: Tensor
+    value: np.ndarray
+    margin: np.ndarray
+    fallback: np.ndarray
+    retreats: np.ndarray
 
 
 class Shield:
     """Filters one action a tick for a batch of robots, remembering what they saw and did.
 
-    Whatever is wrong, the robots stay (see `Units.hold`) where that is found safe; else the fallback acts.
+    Whatever is wrong, the robots stay (see `Limits.hold`) where that is found safe; else the fallback acts.
 
     Args:
         model: a trained safety model, and by its configuration the law.
@@ -65,8 +68,6 @@ class Shield:
     Attributes:
         guard: checks what is seen and told.
         pace: of the decisions.
-        executed: what the robots were told in the last ticks, as the world model hears it: (B, A) each, the latest
-            last, at most as many as a step of the world model takes.
         beliefs: of the episode, by the frames that the world model has seen: where its step is several ticks, every so
             many frames, beginning with one, with the next, and so on. The first is the one that sees the next frame.
         observed: what the last decision was made on.
@@ -102,11 +103,11 @@ class Shield:
         self.guard.reset()
         skip = self.model.config.world_model.frame_skip
         self.beliefs = deque([Belief()] * skip, maxlen=skip)
-        self.executed: deque[Tensor] = deque(maxlen=skip)
+        self._told_at: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=skip)
         self.observed: dict[str, Tensor] | None = None
         self.decision: FilterDecision | None = None
         self.overrides: Overrides | None = None
-        self._told = False
+        self._has_acted = False
 
     @torch.no_grad()
     def warm_up(self) -> None:
@@ -115,17 +116,15 @@ class Shield:
             return
         drawn_elsewhere = torch.random.fork_rng([self.model.device] if self.model.device.type == "cuda" else [])
         with self._lock, self.model.single_precision(), drawn_elsewhere:
-            units, size = self.model.units, self.model.config.world_model.image_size
-            images = {key: torch.zeros(1, 3, size, size, device=units.device) for key in self.guard.cameras.keys}
-            self.guard.pose = units.state_mean[None]
-            hold, fault = (
-                units.hold(self.guard.pose).nan_to_num(0.0),
-                torch.zeros(1, dtype=torch.long, device=units.device),
-            )
-            self.overrides = Overrides(1, units.device)
+            model, size = self.model, self.model.config.world_model.image_size
+            images = {key: torch.zeros(1, 3, size, size, device=model.device) for key in self.guard.cameras.keys}
+            self.guard.pose = on_host(model.units.state_mean[None])
+            hold, fault = np.nan_to_num(model.limits.hold(self.guard.pose), nan=0.0), np.zeros(1, np.int64)
+            self.overrides = Overrides(1)
             # In the thread that decides later on, as what is made at first use is made for each thread.
             seconds = None if self.patience() is None else math.inf
-            self._judge(Seen(images, self.guard.pose, fault), fault, self._hear(hold), hold, seconds)
+            heard = self._hear(hold, self.guard.pose)
+            self._judge(Seen(images, self.guard.pose, fault), fault, heard, hold, seconds)
             self._warm = True
             self._forget()
 
@@ -168,19 +167,22 @@ class Shield:
             seen = self.guard.observe(observation)
             faults = self._late(seen.fault, age_s, Reason.OBSERVATION_STALE)
             hold = self.guard.hold(seen.state)
-            faults, proposed, clipped = self.guard.check_action(proposed, faults, hold, missing_reason, planned)
-            for found in (fault, rate):
-                if found != Reason.PASSED:
-                    faults = first_fault(faults, torch.ones_like(faults, dtype=torch.bool), found)
-            self.overrides = self.overrides or Overrides(len(hold), hold.device)
+            faults, wanted, clipped = self.guard.check_action(proposed, faults, hold, missing_reason, planned)
+            faults = or_else(faults, fault or rate)
+            self.overrides = self.overrides or Overrides(len(hold))
             # What is wrong is not judged: in its place stands what would be done instead, to stay.
-            judged = self._hear(torch.where((faults != Reason.PASSED)[:, None], hold, clipped))
-            judgement, faults = self._judge(seen, faults, judged, hold, self.patience(len(hold)))
+            judged = np.where((faults != Reason.PASSED)[:, None], hold, clipped)
+            heard = None if law.name == "guard" else self._hear(judged, self.guard.pose)
+            judgement, faults = self._judge(seen, faults, heard, hold, self.patience(len(hold)))
             self.took_s = self.clock() - started
             faults = self._late(faults, age_s + self.took_s, Reason.DEADLINE_MISSED, len(hold), self.took_s)
-            decision = self._decide(judgement, seen, faults, hold, proposed, clipped)
-            decision = replace(decision, heard=judged)
+            decision = self._decide(judgement, seen, faults, hold, wanted, clipped)
             self._remember(judgement, decision, observation)
+            decision.heard = heard
+            decision = decision.to(self.model.device)
+            self.decision = replace(
+                decision, action=decision.action.clone()
+            )  # what is returned is the caller's to change
             return decision
 
     def _say_if_disarmed(self) -> None:
@@ -198,64 +200,72 @@ class Shield:
         patience = self.patience(n)
         return None if patience is None else patience - age_s - self.took_s
 
-    def _late(self, faults: Tensor, age_s: float, reason: Reason, n: int = 1, took_s: float = 0.0) -> Tensor:
+    def _late(self, faults: np.ndarray, age_s: float, reason: Reason, n: int = 1, took_s: float = 0.0) -> np.ndarray:
         """Mark all as late where an observation is too old, or a decision took too long; a time that is no number is.
 
         Args:
             n: robots that one call decides for; each has a period.
         """
-        law, everyone = self.model.config.law, torch.ones_like(faults, dtype=torch.bool)
+        law = self.model.config.law
         in_time = 0 <= age_s <= self.pace.oldest(law.slack_ms, n)
         in_time &= took_s >= 0 and (law.deadline_ms is None or took_s * 1e3 <= law.deadline_ms)
-        return faults if in_time else first_fault(faults, everyone, reason)
+        return faults if in_time else or_else(faults, reason)
 
     def _judge(
-        self, seen: Seen, faults: Tensor, judged: Tensor, hold: Tensor, seconds: float | None
-    ) -> tuple[Judgement, Tensor]:
+        self, seen: Seen, faults: np.ndarray, heard: Tensor | None, hold: np.ndarray, seconds: float | None
+    ) -> tuple[Judgement, np.ndarray]:
         """What the world model says of actions as it hears them (B, A), and the faults with its own.
 
         A world model that has not answered after so many seconds, or that failed, has missed a frame. So it remembers
         nothing, and the next tick begins with what it sees.
         """
-        nothing = torch.full((len(hold),), torch.nan, device=hold.device)
-        unknown = Judgement(Belief(), nothing, nothing, hold, torch.zeros_like(nothing, dtype=torch.bool))
+        nothing = np.full(len(hold), np.nan, np.float32)
+        unknown = Judgement(Belief(), nothing, nothing, hold, np.zeros(len(hold), bool))
         if self.model.config.law.name == "guard":
             return unknown, faults
         try:
-            return self._in_time(lambda: self._imagine(seen, faults, judged, hold), seconds)
+            return self._in_time(lambda: self._imagine(seen, faults, heard, hold), seconds)
         except TimeoutError as e:
             self.note_failure("the filter was late", e)
             reason = Reason.DEADLINE_MISSED
         except Exception as e:
             self.note_failure("the filter failed", e)
             reason = Reason.FILTER_FAILED
-        return unknown, first_fault(faults, torch.ones_like(faults, dtype=torch.bool), reason)
+        return unknown, or_else(faults, reason)
 
-    def _imagine(self, seen: Seen, faults: Tensor, judged: Tensor, hold: Tensor) -> tuple[Judgement, Tensor]:
+    def _imagine(self, seen: Seen, faults: np.ndarray, heard: Tensor, hold: np.ndarray) -> tuple[Judgement, np.ndarray]:
         """Take in what is seen, and look ahead; changes nothing here, as it may be late."""
         percepts = self.model.world_model.perceive(seen.images)
-        faults = first_fault(faults, ~is_sound(percepts), Reason.FILTER_FAILED)
-        belief = self._filter_history(percepts, seen.state, judged, faults)
-        return Judgement(belief, *self._look_ahead(belief.latent, judged, hold)), faults
+        unsound = ~is_sound(percepts)
+        blind = self.model.tensor(np.isin(faults, UNSEEN)) | (self.model.tensor(faults == Reason.PASSED) & unsound)
+        belief = self._filter_history(percepts, seen.state, heard, blind)
+        judgement = Judgement(belief, *self._look_ahead(belief.latent, heard, hold))
+        return judgement, or_else(faults, first_of({Reason.FILTER_FAILED: on_host(unsound, torch.bool)}))
 
-    def _look_ahead(self, latent: Latent, judged: Tensor, hold: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _look_ahead(self, latent: Latent, heard: Tensor, hold: np.ndarray) -> tuple[np.ndarray, ...]:
         """V of an action and l now (B,); the fallback (B, A); whether an override would be the retreat's (B,)."""
         model = self.model
         margin = model.imagination.margin(latent)
-        predicted, on_the_way = self._go_on(latent, judged)
+        predicted, on_the_way = self._go_on(latent, heard)
         both = {key: torch.cat([predicted[key], latent[key]]) for key in latent}  # one pass through imagination
         sizes = [len(on_the_way), len(hold)]
         (value, here), (_, action) = (part.split(sizes) for part in model.plan(both))
-        retreats = self.overrides.retreats(model.config.law)
-        moves = retreats & torch.isfinite(here)  # where nothing is known, nothing moves
-        fallback = torch.where(moves[:, None], self._retreat(hold), self._usable(action, here, hold))
         # A margin that is negative now, or on the way, is a failure whatever comes after.
         value = model.worst(on_the_way, value).view(-1, len(hold)).amin(0)
         value = torch.where(is_sound(latent), model.worst(margin, value), torch.nan)
-        return value, margin, fallback, retreats
+        retreats, known = self.overrides.retreats(model.config.law), np.isfinite(on_host(here))
+        moves = retreats & known  # where nothing is known, nothing moves
+        fallback = np.where(moves[:, None], self._retreat(hold), self._usable(action, known, hold))
+        return on_host(value), on_host(margin), fallback, retreats
 
     def _decide(
-        self, judgement: Judgement, seen: Seen, faults: Tensor, hold: Tensor, proposed: Tensor, clipped: Tensor
+        self,
+        judgement: Judgement,
+        seen: Seen,
+        faults: np.ndarray,
+        hold: np.ndarray,
+        proposed: np.ndarray,
+        clipped: np.ndarray,
     ) -> FilterDecision:
         """The law's decision, once all that can be known is known."""
         law, value = self.model.config.law, judgement.value
@@ -263,15 +273,14 @@ class Shield:
         if law.name == "guard":
             return by_checks_alone(proposed, hold, faults, monitors, clipped)
         threshold = self.overrides.threshold(law)
-        fallback = torch.where(self._stays(faults, value, threshold, seen.state), hold, judgement.fallback)
+        fallback = np.where(self._stays(faults, value, threshold, seen.state), hold, judgement.fallback)
         return least_restrictive(proposed, fallback, value, judgement.margin, threshold, faults, monitors, clipped)
 
     def _remember(self, judgement: Judgement, decision: FilterDecision, observation: dict[str, Any]) -> None:
-        self.overrides = self.overrides.after(decision.intervened, judgement.retreats)
+        self.overrides = self.overrides.after(decision.intervened.numpy(), judgement.retreats)
         self.beliefs.append(judgement.belief)  # in place of the one that it grew out of
-        self.decision = replace(decision, action=decision.action.clone())  # what is returned is the caller's to change
-        self.observed = {key: observation[key] for key in self.model.inputs if key in observation}
-        self._was_told(self.decision.action)
+        self.observed = {key: observation[key] for key in self.guard.inputs if key in observation}
+        self._was_told(decision.action.numpy().copy())
         self._tell(decision)
 
     @property
@@ -279,19 +288,27 @@ class Shield:
         """The posterior that the last decision was made on."""
         return self.beliefs[-1].latent
 
+    @property
+    def executed(self) -> list[Tensor]:
+        """What the robots were told in the last ticks, as the world model hears it: (B, A) each, the latest last, at
+        most as many as a step of the world model takes."""
+        return [self._hear(action, pose) for action, pose in self._told_at]
+
     def was_executed(self, action: Tensor) -> None:
         """Remember (B, A) in robot units as what was done, where something else was than was decided."""
-        if self.executed:
-            self.executed.pop()
-        self._was_told(action)
+        if self._told_at:
+            self._told_at.pop()
+        self._was_told(on_host(action).copy())
 
-    def _was_told(self, action: Tensor) -> None:
+    def _was_told(self, action: np.ndarray) -> None:
         self.guard.was_told(action)
-        self.executed.append(self._hear(action))
+        self._told_at.append((action, self.guard.pose))
 
-    def _hear(self, action: Tensor) -> Tensor:
-        """An action (B, A) in robot units as the world model hears it; what is not known does not move."""
-        return self.model.units.heard_action(action, self.guard.pose).nan_to_num(0.0)
+    def _hear(self, action: np.ndarray, pose: np.ndarray) -> Tensor:
+        """An action (B, A) at a pose (B, S) as the world model hears it; what is not known does not move."""
+        model = self.model
+        at = model.tensor(pose) if model.units.has_targets else None
+        return model.units.heard_action(model.tensor(action), at).nan_to_num(0.0)
 
     def note_failure(self, what: str, error: BaseException) -> None:
         """Count a failure that a decision survived; its trace is logged the first time."""
@@ -299,29 +316,29 @@ class Shield:
         trace = error if self.failures[what] == 1 else None
         logger.error("%s (%s: %s); nothing passes for that", what, type(error).__name__, error, exc_info=trace)
 
-    def _stays(self, fault: Tensor, value: Tensor, threshold: Tensor, state: Tensor) -> Tensor:
+    def _stays(self, fault: np.ndarray, value: np.ndarray, threshold: np.ndarray, state: np.ndarray) -> np.ndarray:
         """Commands (B, A) that stay as they were, instead of the fallback's.
 
         A fault does not move a robot for which staying is safe, as far as is known; and a target moves nowhere from a
         place that is not known.
         """
-        units, broken = self.model.units, (fault != Reason.PASSED) & (fault != Reason.NO_BASE_POLICY)
-        stays = (broken & (value > threshold)) | ~value.isfinite()
-        return stays[:, None] | (units.is_target & units.seen(state).isnan())
+        limits, broken = self.model.limits, (fault != Reason.PASSED) & (fault != Reason.NO_BASE_POLICY)
+        stays = (broken & (value > threshold)) | ~np.isfinite(value)
+        return stays[:, None] | (limits.is_target & np.isnan(limits.seen(state)))
 
-    def _retreat(self, hold: Tensor) -> Tensor:
+    def _retreat(self, hold: np.ndarray) -> np.ndarray:
         """The motion of `law.retreat`, with all other commands as they were: (B, A) in robot units."""
-        action, units = hold.clone(), self.model.units
+        action, limits = hold.copy(), self.model.limits
         for name, motion in self.model.config.law.retreat.items():
-            i = units.action_names.index(name)
-            action[:, i] = motion + (hold[:, i] if units.is_target[i] else 0.0)
+            i = limits.action_names.index(name)
+            action[:, i] = motion + (hold[:, i] if limits.is_target[i] else 0.0)
         return action
 
     def _tell(self, decision: FilterDecision) -> None:
         """Log the first override of an episode."""
-        if self._told or not decision.unsafe.any():
+        if self._has_acted or not decision.unsafe.any():
             return
-        self._told = True
+        self._has_acted = True
         given = decision.reason[decision.unsafe].unique().tolist()
         reasons = ", ".join(Reason(number).name.lower().replace("_", " ") for number in given)
         acts = "acts" if decision.intervened.any() else "would act"
@@ -348,7 +365,7 @@ class Shield:
             with self._lock, other._lock:
                 if not (other._decided(observation, action) and self._accepts(other)):
                     continue
-                self.beliefs, self.executed = other.beliefs.copy(), other.executed.copy()
+                self.beliefs, self._told_at = other.beliefs.copy(), other._told_at.copy()
                 for name in ("observed", "decision", "overrides"):
                     setattr(self, name, getattr(other, name))
                 self.guard.adopt(other.guard)
@@ -375,13 +392,13 @@ class Shield:
             )
         return self._same_weights[other]
 
-    def _filter_history(self, percepts: Latent, state: Tensor, judged: Tensor, faults: Tensor) -> Belief:
-        """What the world model makes of the episode; rows whose observation is unusable go on by imagination alone."""
-        world_model, units = self.model.world_model, self.model.units
-        state, blind = units.normalise_state(state).nan_to_num(0.0), torch.isin(faults, faults.new_tensor(UNSEEN))
+    def _filter_history(self, percepts: Latent, state: np.ndarray, heard: Tensor, blind: Tensor) -> Belief:
+        """What the world model makes of the episode; of rows that are blind (B,) it goes on by imagination alone."""
+        world_model, units, executed = self.model.world_model, self.model.units, self.executed
+        shown = units.normalise_state(self.model.tensor(state)).nan_to_num(0.0)
         # Where so many ticks have not been, the belief is a fresh one, and only what counts as first is read of this.
-        n_unknown = self.beliefs.maxlen - len(self.executed)
-        before = torch.cat([*[self.executed[0] if self.executed else judged] * n_unknown, *self.executed], 1)
+        n_unknown = self.beliefs.maxlen - len(executed)
+        before = torch.cat([*[executed[0] if executed else heard] * n_unknown, *executed], 1)
         first = units.first_action(before)
 
         def observe(latent: Latent | None) -> Latent:
@@ -390,7 +407,7 @@ class Shield:
                 lost = ~is_sound(latent)
                 new, led = replace_rows(latent, new, where=lost), torch.where(lost[:, None], first, before)
             predicted = world_model.step(new, led)
-            return replace_rows(world_model.correct(predicted, percepts, state), predicted, where=blind)
+            return replace_rows(world_model.correct(predicted, percepts, shown), predicted, where=blind)
 
         n_frames = self.model.config.world_model.steps(self.model.config.law.history_frames)
         return self.beliefs[0].after(observe, n_frames)
@@ -410,15 +427,15 @@ class Shield:
             least = torch.minimum(least, imagination.margin(latent))
         return latent, least
 
-    def _usable(self, action: Tensor, value: Tensor, hold: Tensor) -> Tensor:
-        """The safety policy's action in robot units; where it or its value is not finite, hold."""
-        units = self.model.units
-        robots = units.denormalise_action(action, self.guard.pose)
-        clipped, far = units.clip(robots, self.guard.pose)  # a fallback is checked like any other action
-        sound = (torch.isfinite(robots).all(-1) & torch.isfinite(value) & ~far)[:, None].expand_as(action)
+    def _usable(self, action: Tensor, known: np.ndarray, hold: np.ndarray) -> np.ndarray:
+        """The safety policy's action in robot units; where it is not finite, or its value is not known, hold."""
+        limits, pose = self.model.limits, self.guard.pose
+        robots = on_host(self.model.units.denormalise_action(action, self.model.tensor(pose)))
+        clipped, far = limits.clip(robots, pose)  # a fallback is checked like any other action
+        sound = (np.isfinite(robots).all(-1) & known & ~far)[:, None]
         # A target that does not move stays as it was told, so that an arm does not sink, and a grip does not open.
-        sound = sound & ~(units.stays | (units.is_target & (action == 0)))
-        return torch.where(sound, clipped, hold)
+        sound = sound & ~(limits.stays | (limits.is_target & (on_host(action) == 0)))
+        return np.where(sound, clipped, hold)
 
 
 def _same(observation: dict[str, Any], other: dict[str, Any]) -> bool:

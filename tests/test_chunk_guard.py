@@ -2,6 +2,7 @@
 
 import logging
 
+import numpy as np
 import pytest
 import tiny
 import tiny_policies
@@ -13,6 +14,7 @@ from lerobot_latentsafe import ChunkGuardStep
 from lerobot_latentsafe.chunk_guard import UnsafeActionError
 from lerobot_latentsafe.decision import Reason
 from lerobot_latentsafe.guard import check_plan
+from lerobot_latentsafe.limits import Limits
 from lerobot_latentsafe.modeling_latentsafe import load_filter
 from lerobot_latentsafe.units import TrainedOn, Units
 
@@ -25,7 +27,7 @@ TARGETS = TrainedOn(
     displacement_scale=[1.0, 1.0], state_low=[-10.0, -10.0], state_high=[10.0, 10.0], state_step=[1.0, 1.0],
     state_mean=[0.0, 0.0], state_std=[3.0, 3.0], action_step=[1.0, 1.0], action_jerk=[0.5, 0.5],
 )  # fmt: skip
-UNITS = Units(TARGETS, [])
+LIMITS = Limits(TARGETS, Units(TARGETS, []))
 
 
 def chunk(start=0.0, step=0.5):
@@ -62,19 +64,20 @@ WRONG = {
 
 
 def test_a_steady_plan_passes():
-    assert not check_plan(UNITS, chunk()).any()
-    assert not check_plan(UNITS, chunk(), [chunk()[:, 0] - 1.0, chunk()[:, 0] - 0.5]).any()
+    plan = chunk().numpy()
+    assert not check_plan(LIMITS, plan).any()
+    assert not check_plan(LIMITS, plan, [plan[:, 0] - 1.0, plan[:, 0] - 0.5]).any()
 
 
 @pytest.mark.parametrize("name", WRONG)
 def test_what_is_wrong_is_found_where_it_is(name):
     change, reason = WRONG[name]
-    fault = check_plan(UNITS, change(chunk()))
+    fault = check_plan(LIMITS, change(chunk()).numpy())
     assert fault[0, AT] == reason and not fault[0, :AT].any() and not fault[1].any()
 
 
 def test_the_first_action_follows_those_before():
-    fault = check_plan(UNITS, chunk(), [torch.full((2, 2), -9.0)])
+    fault = check_plan(LIMITS, chunk().numpy(), [np.full((2, 2), -9.0, np.float32)])
     assert (fault[:, 0] == Reason.ACTION_JUMPS).all() and not fault[:, 2:].any()
 
 
@@ -226,7 +229,7 @@ def test_a_policy_takes_the_step_along_when_it_is_saved(tmp_path):
 
 def test_the_step_of_a_guard_or_filter(tmp_path):
     folder = tiny.save_arm_filter(tmp_path / "filter")
-    assert ChunkGuardStep.of(folder).units.action_names == tiny.ARM
+    assert ChunkGuardStep.of(folder).limits.action_names == tiny.ARM
 
 
 def test_looking_ahead_is_no_action():

@@ -36,7 +36,7 @@ def note(outcome):
 def assert_harmless(bench, decision, usable):
     """What is executed is finite and in the data's range; what is unusable does not pass."""
     units = bench.policy.model.units
-    within = 1e-4 + (units.displacement_high if bench.targets else 0.0)
+    within = 1e-4 + (torch.tensor(bench.policy.config.trained_on.displacement_high) if bench.targets else 0.0)
     assert decision.action.shape == bench.wanted.shape and decision.action.isfinite().all()
     assert ((decision.action >= units.action_low - within) & (decision.action <= units.action_high + within)).all()
     passed = decision.reason == Reason.PASSED

@@ -13,7 +13,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.video_utils import VideoEncodingManager
 
@@ -38,7 +37,7 @@ def features(video):
 def sent(episode, t):
     """What the robot executed, and the decision that led to it: always the same in the same episode and frame."""
     executed = [episode + t / 8, -t / 8]
-    judged = least_restrictive(torch.zeros(1, 2), torch.ones(1, 2), torch.tensor([t / 8]), torch.ones(1), 0.0)
+    judged = least_restrictive(np.zeros((1, 2)), np.ones((1, 2)), np.array([t / 8]), np.ones(1), 0.0)
     return dict(zip(NAMES, executed)), judged
 
 

@@ -1,17 +1,18 @@
 import math
 
+import numpy as np
 import pytest
 import torch
 
 from lerobot_latentsafe.decision import Reason, least_restrictive
 
-PROPOSED, FALLBACK = torch.tensor([[0.5, 1.0]]), torch.tensor([[-1.0, 1.0]])
+PROPOSED, FALLBACK = np.float32([[0.5, 1.0]]), np.float32([[-1.0, 1.0]])
 
 
 def decide(value, epsilon=0.1, fault=None, monitor=False):
-    fault = None if fault is None else torch.tensor([int(fault)])
+    fault = None if fault is None else np.array([fault])
     return least_restrictive(
-        PROPOSED, FALLBACK, torch.tensor([value]), torch.tensor([0.3]), epsilon, fault=fault, monitor=monitor
+        PROPOSED, FALLBACK, np.float32([value]), np.float32([0.3]), epsilon, fault=fault, monitor=monitor
     )
 
 
@@ -34,8 +35,8 @@ def test_truth_table(value, reason, monitor):
     assert decision.reason.item() == reason
     assert decision.unsafe.item() == (reason != Reason.PASSED)
     assert decision.intervened.item() == (reason != Reason.PASSED and not monitor)
-    torch.testing.assert_close(decision.action, FALLBACK if decision.intervened else PROPOSED)
-    torch.testing.assert_close(decision.proposed, PROPOSED)
+    np.testing.assert_array_equal(decision.action, FALLBACK if decision.intervened else PROPOSED)
+    np.testing.assert_array_equal(decision.proposed, PROPOSED)
 
 
 @pytest.mark.parametrize("fault", [r for r in Reason if r != Reason.PASSED])
@@ -43,7 +44,7 @@ def test_truth_table(value, reason, monitor):
 def test_a_fault_falls_back_whatever_the_value(fault, value):
     decision = decide(value, fault=fault)
     assert decision.intervened and decision.reason.item() == fault
-    torch.testing.assert_close(decision.action, FALLBACK)
+    np.testing.assert_array_equal(decision.action, FALLBACK)
 
 
 def test_no_fault_leaves_the_verdict_to_the_value():
@@ -55,7 +56,7 @@ def test_monitor_reports_faults_but_never_acts():
     decision = decide(0.2, fault=Reason.OBSERVATION_STALE, monitor=True)
     assert decision.unsafe and not decision.intervened
     assert decision.reason.item() == Reason.OBSERVATION_STALE
-    torch.testing.assert_close(decision.action, PROPOSED)
+    np.testing.assert_array_equal(decision.action, PROPOSED)
 
 
 @pytest.mark.parametrize(("epsilon", "passes"), [(-math.inf, True), (math.inf, False), (math.nan, False)])
@@ -64,10 +65,10 @@ def test_extreme_epsilons(epsilon, passes):
 
 
 def test_rows_are_decided_alone():
-    value = torch.tensor([0.5, -0.5, math.nan, 0.5])
-    fault = torch.tensor([0, 0, 0, int(Reason.ACTION_OUT_OF_RANGE)])
-    proposed, fallback = torch.arange(4.0)[:, None], -torch.arange(4.0)[:, None] - 10
-    decision = least_restrictive(proposed, fallback, value, torch.zeros(4), 0.0, fault)
+    value = np.float32([0.5, -0.5, math.nan, 0.5])
+    fault = np.array([0, 0, 0, Reason.ACTION_OUT_OF_RANGE])
+    proposed = np.arange(4.0, dtype=np.float32)[:, None]
+    decision = least_restrictive(proposed, -proposed - 10, value, np.zeros(4, np.float32), 0.0, fault)
     assert decision.action.flatten().tolist() == [0.0, -11.0, -12.0, -13.0]
     assert decision.reason.tolist() == [0, 1, 2, 7]
     assert decision.intervened.dtype == torch.bool and decision.reason.dtype == torch.int64

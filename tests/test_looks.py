@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 import torch
 from torch.nn import functional as F
@@ -14,9 +15,9 @@ from lerobot_latentsafe.looks import (
     Look,
     Response,
     detail,
+    halved,
     learn_looks,
     shrink,
-    thumbnails,
 )
 
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"
@@ -47,7 +48,7 @@ def record():
     state = (0.5 + steps.cumsum(1)).clamp(0, 1).flatten(0, 1)
     front = torch.stack([scene(background(1), place) for place in state[:, :2]])
     wrist = torch.stack([scene(background(2).flip(1), place) for place in state[:, 1:]])
-    return {FRONT: front, WRIST: wrist}, (state - 0.5) / 0.2, torch.arange(EPISODES).repeat_interleave(LENGTH)
+    return {FRONT: front, WRIST: wrist}, ((state - 0.5) / 0.2).numpy(), np.arange(EPISODES).repeat(LENGTH)
 
 
 @pytest.fixture(scope="module")
@@ -58,8 +59,11 @@ def recorded():
 @pytest.fixture(scope="module")
 def looks(recorded):
     pictures, state, episode = recorded
-    small = {key: shrink(picture) for key, picture in pictures.items()}
-    shown = {key: thumbnails(picture) for key, picture in small.items()}
+    return learned({key: shrink(picture) for key, picture in pictures.items()}, state, episode)
+
+
+def learned(small, state, episode):
+    shown = {key: halved(picture) for key, picture in small.items()}
     return learn_looks(shown, {key: detail(picture) for key, picture in small.items()}, state, episode)
 
 
@@ -100,7 +104,7 @@ DEAD = {
 STRANGE = {
     "uniform noise": torch.rand_like, "2 pixels": of_side(2), "4 pixels": of_side(4), "8 pixels": of_side(8),
     "16 pixels": of_side(16), "a thumbnail": of_side(16, blown_up=False), "negative": lambda x: 1 - x,
-    **{name: ALTERATIONS[name] for name in ALTERATIONS},
+    **{name: lambda x, alter=alter: torch.from_numpy(alter(x.numpy()).copy()) for name, alter in ALTERATIONS.items()},
 }  # fmt: skip
 
 
@@ -157,9 +161,8 @@ def test_exchanged_cameras_are_told_and_named(recorded, looks):
 
 def test_what_the_data_do_not_tell_apart_is_not_tested():
     symmetric = torch.rand(40, 1, 1, 1) * 0.1 + torch.linspace(0.2, 0.8, PIXELS)[:, None].expand(40, 3, PIXELS, PIXELS)
-    small = shrink(symmetric)
-    frames = torch.zeros(40)
-    look = learn_looks({FRONT: thumbnails(small)}, {}, torch.zeros(40, 0), frames)[FRONT]
+    thumbnails = halved(shrink(symmetric))
+    look = learn_looks({FRONT: thumbnails}, {}, np.zeros((40, 0), np.float32), np.zeros(40, int))[FRONT]
     assert {*look.told} == {"upside down", "flipped", "turned left", "turned right"}
     _, strange, _ = Cameras([FRONT], {FRONT: look}).check({FRONT: symmetric.flip(-1)})
     assert not strange.any()
@@ -201,13 +204,13 @@ def test_a_filter_that_knows_no_looks_tells_pictures_that_are_exactly_old(record
     watch = cameras(None)
     for t in range(4):
         _, _, seen = watch.check({key: picture[:1] for key, picture in pictures.items()})
-        assert watch.repeats(seen, torch.full((1, 3), 0.06 * t)).all() == (t >= REPEATS)
+        assert watch.repeats(seen, np.full((1, 3), 0.06 * t, np.float32)).all() == (t >= REPEATS)
 
 
 def test_what_a_camera_does_not_see_may_move(recorded, looks):
     pictures, state, _ = recorded
     assert looks[WRIST].unseen[0] > 0.1 > looks[WRIST].unseen[1]  # the first number moves what the front camera sees
-    watch, moves = cameras(looks), torch.tensor([[1.0, 0.0, 0.0]])
+    watch, moves = cameras(looks), np.float32([[1.0, 0.0, 0.0]])
     pictures = {FRONT: pictures[FRONT], WRIST: pictures[WRIST][:1].expand_as(pictures[FRONT])}
     for t in range(4):
         _, _, seen = watch.check({key: picture[t : t + 1] for key, picture in pictures.items()})
@@ -226,10 +229,9 @@ def test_black_frames_of_a_recording_teach_nothing(recorded, looks):
     pictures, state, episode = recorded
     small = {key: shrink(picture) for key, picture in pictures.items()}
     small[FRONT][:2] = 0.0
-    shown = {key: thumbnails(picture) for key, picture in small.items()}
-    learned = learn_looks(shown, {key: detail(picture) for key, picture in small.items()}, state, episode)[FRONT]
-    assert learned.frames == looks[FRONT].frames - 2
-    assert learned.contrast[0] > 0.5 * looks[FRONT].contrast[0] and learned.furthest < 2 * looks[FRONT].furthest
+    look = learned(small, state, episode)[FRONT]
+    assert look.frames == looks[FRONT].frames - 2
+    assert look.contrast[0] > 0.5 * looks[FRONT].contrast[0] and look.furthest < 2 * looks[FRONT].furthest
 
 
 def test_grey_cameras_and_other_sizes_are_read(recorded, looks):
@@ -248,12 +250,12 @@ def test_looks_survive_json(looks):
 
 # -- the response of the state ---
 
-TARGETS, DELTAS = torch.tensor([False, False]), torch.tensor([True, True])
+TARGETS, DELTAS = np.array([False, False]), np.array([True, True])
 
 
 def unanswered(adds_up, states, commands):
-    response = Response(torch.tensor([0.01, 0.01]), adds_up)
-    return torch.cat([response.unanswered(s[None], c[None]) for s, c in zip(states, commands)])
+    response = Response(np.float32([0.01, 0.01]), adds_up)
+    return np.concatenate([response.unanswered(s[None], c[None]) for s, c in zip(states, commands)])
 
 
 @pytest.mark.parametrize("adds_up", [TARGETS, DELTAS], ids=["targets", "deltas"])
@@ -261,17 +263,16 @@ def unanswered(adds_up, states, commands):
     "R05", "the whole observation is frozen while moves are sent", "The robot goes no further: `OBSERVATION_STALE`"
 )
 def test_a_state_that_does_not_answer_is_told(adds_up):
-    steps = torch.tensor([0.1, 0.0]).repeat(20, 1)
-    place = steps.cumsum(0)
-    nothing = torch.full((1, 2), torch.nan)
-    commands = torch.cat([nothing, steps if adds_up.all() else place])[:20]
-    healthy = unanswered(adds_up, torch.cat([torch.zeros(1, 2), place])[:20], commands)
+    steps = np.float32([[0.1, 0.0]] * 20)
+    place, nothing, start = steps.cumsum(0), np.float32([[np.nan, np.nan]]), np.zeros((1, 2), np.float32)
+    commands = np.concatenate([nothing, steps if adds_up.all() else place])[:20]
+    healthy = unanswered(adds_up, np.concatenate([start, place])[:20], commands)
     assert healthy.max() < 0.11
-    frozen = unanswered(adds_up, torch.zeros(20, 2), commands)
+    frozen = unanswered(adds_up, np.zeros((20, 2), np.float32), commands)
     assert frozen[-1, 0] > 1.5 and frozen[:, 1].max() == 0
 
 
 def test_commands_that_go_nowhere_need_no_answer():
-    back_and_forth = torch.tensor([[0.1, 0.0], [-0.1, 0.0]]).repeat(10, 1)
-    assert unanswered(DELTAS, torch.zeros(20, 2), back_and_forth).max() < 0.11
-    assert unanswered(TARGETS, torch.zeros(20, 2), torch.ones(20, 2)).max() == 0
+    back_and_forth, stands = np.float32([[0.1, 0.0], [-0.1, 0.0]] * 10), np.zeros((20, 2), np.float32)
+    assert unanswered(DELTAS, stands, back_and_forth).max() < 0.11
+    assert unanswered(TARGETS, stands, np.ones((20, 2), np.float32)).max() == 0

@@ -195,7 +195,7 @@ def test_monitor_sees_what_the_shield_sees(latent, policy):
     before[:, :2] -= car.DT * np.stack([np.cos(heading), np.sin(heading)], -1)
     policy.config.change(law=policy.config.law.changed(LawOptions(epsilon=0.0, mode="monitor")))
     policy.reset()
-    straight = policy.model.units.hold(torch.zeros(20, 2))
+    straight = torch.from_numpy(policy.model.limits.hold(np.zeros((20, 2), np.float32)))
     for states in (before, STATES):
         policy.shield(tiny.observation(states), straight)
     for key, value in latent.latent(STATES).items():

@@ -170,7 +170,7 @@ def test_outcomes_by_hand():
 
 def test_a_violation_counts_even_when_the_goal_is_reached(shielded, monkeypatch):
     """Straight through the disc, and on to the right edge."""
-    straight = shielded.model.units.hold(torch.zeros(1, 2))
+    straight = torch.from_numpy(shielded.model.limits.hold(np.zeros((1, 2), np.float32)))
     monkeypatch.setattr(shielded.base, "propose", lambda _: straight)
     monkeypatch.setattr(dubins_env, "sample_task_start", lambda _: np.array([-0.9, 0.0, 0.0]))
     episodes = run_episodes(shielded.base, car(episode_length=80), 1, seed=0)

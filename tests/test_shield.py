@@ -2,6 +2,7 @@ import math
 import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import tiny
 import torch
@@ -9,6 +10,7 @@ import torch
 from lerobot_latentsafe.critic import FallbackConfig
 from lerobot_latentsafe.datasets.clips import Clip
 from lerobot_latentsafe.decision import LawConfig, Overrides, Reason
+from lerobot_latentsafe.limits import Limits
 from lerobot_latentsafe.shield import Shield
 from lerobot_latentsafe.units import Units
 
@@ -302,7 +304,7 @@ def test_once_the_filter_acts_the_policy_is_released_above_another_value(permiss
     value = shield(along(1)[0], actions(LEFT)).value
     for acting, release in ((False, 1.0), (True, value.min().item() - 1e-3), (True, value.max().item() + 1e-3)):
         shield.reset()
-        shield.overrides = Overrides(3, shield.model.device)
+        shield.overrides = Overrides(3)
         config.law.resume_above, shield.overrides.recent[:, -1] = release, acting
         assert (shield(along(1)[0], actions(LEFT)).intervened == (release > value) & acting).all()
         assert shield.overrides.recent[:, -2].all() == acting
@@ -439,7 +441,7 @@ def test_robot_is_held_when_even_the_latent_is_not_finite(permissive):
     for permissive.config.law.retreat in ({}, RETREAT):
         decision = permissive.shield(along(1)[0], actions(LEFT))
         assert decision.reason.eq(Reason.VALUE_NOT_FINITE).all()
-        torch.testing.assert_close(decision.action, permissive.model.units.hold(torch.zeros(3, 2)))
+        torch.testing.assert_close(decision.action, staying(permissive, 3))
 
 
 @pytest.mark.parametrize(
@@ -453,10 +455,16 @@ def test_a_plan_of_another_shape_does_not_pass(permissive, plan, caplog):
     assert "expected one of (robots, actions, 2)" in caplog.text
 
 
+def staying(policy, n):
+    """What it is for n robots to stay."""
+    return torch.from_numpy(policy.model.limits.hold(np.zeros((n, 2), np.float32)))
+
+
 def test_hold_is_zero_motion_or_the_nearest_the_range_allows(policy):
-    assert policy.model.units.hold(torch.zeros(2, 2)).tolist() == [[0.0, 1.0]] * 2  # the speed never varies
+    assert staying(policy, 2).tolist() == [[0.0, 1.0]] * 2  # the speed never varies
     forward = replace(policy.config.trained_on, action_low=[0.25, 1.0], action_high=[0.75, 1.0])
-    assert Units(forward, []).hold(torch.zeros(1, 2)).tolist() == [[0.25, 1.0]]
+    limits = Limits(forward, Units(forward, []))
+    assert limits.hold(np.zeros((1, 2), np.float32)).tolist() == [[0.25, 1.0]]
 
 
 def test_monitor_mode_lets_everything_through_and_reports(strict):
@@ -530,7 +538,7 @@ def test_baseline_laws_need_no_critic(tiny_world_model, law):
     assert decision.value.isfinite().all()
     if law == "margin":
         policy.config.law.epsilon = 2.0
-        torch.testing.assert_close(policy.shield(seen, proposed).action, policy.model.units.hold(torch.zeros(1, 2)))
+        torch.testing.assert_close(policy.shield(seen, proposed).action, staying(policy, 1))
 
 
 def test_unknown_law_is_refused():

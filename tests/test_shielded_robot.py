@@ -395,7 +395,7 @@ def test_a_journal_goes_on_and_forgets_what_is_recorded_again(tmp_path):
     def note(journal, episode, values):
         journal.begin(episode)
         for value in values:
-            judged = least_restrictive(torch.zeros(1, 2), torch.ones(1, 2), torch.tensor([value]), torch.ones(1), 0.0)
+            judged = least_restrictive(np.zeros((1, 2)), np.ones((1, 2)), np.float32([value]), np.ones(1), 0.0)
             journal.add(judged, [0.0, 1.0])
 
     path = tmp_path / "shield" / "decisions.parquet"
@@ -431,7 +431,7 @@ def test_decisions_of_another_dataset_are_refused(tmp_path):
     with pytest.raises(ValueError, match="not a readable file of decisions"):
         decision_columns(torn, frames_of([0.0, 1.0]))
     journal = Journal(tmp_path / "decisions.parquet")
-    judged = least_restrictive(torch.zeros(1, 2), torch.ones(1, 2), torch.ones(1), torch.ones(1), 0.0)
+    judged = least_restrictive(np.zeros((1, 2)), np.ones((1, 2)), np.ones(1), np.ones(1), 0.0)
     for executed in ([0.0, 1 / 3], [0.5, 1.0]):
         journal.add(judged, executed)
     journal.write()

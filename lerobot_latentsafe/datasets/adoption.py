@@ -5,12 +5,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import torch
 
 from lerobot_latentsafe.datasets.contract import ACTION, STATE, Contract, DatasetContractError
+from lerobot_latentsafe.limits import AT_REST
 from lerobot_latentsafe.looks import Response, by_tick
 from lerobot_latentsafe.meanings import Command, contradictions, settle, tell_meanings
-from lerobot_latentsafe.units import AT_REST, TrainedOn
+from lerobot_latentsafe.units import TrainedOn
 
 logger = logging.getLogger(__name__)
 
@@ -137,15 +137,16 @@ def _largest_change(contract: Contract, order: int) -> np.ndarray:
 
 def _unanswered(contract: Contract, rest: np.ndarray, adds_up: np.ndarray) -> np.ndarray:
     """How far each command goes at most while the state stays as it is: (A,); see `looks.Response`."""
-    state, action = torch.from_numpy(contract.state), torch.from_numpy(contract.action)
-    response = Response(torch.from_numpy(np.float32(rest)), torch.from_numpy(adds_up))
-    sent, most = torch.full_like(action[:1], torch.nan), torch.zeros(action.shape[1])
-    for frames in by_tick(torch.from_numpy(contract.episode)):
+    state, action = contract.state, contract.action
+    response, most = Response(rest.astype(np.float32), adds_up), np.zeros(action.shape[1], np.float32)
+    sent = np.full_like(action[:1], np.nan)
+    for frames in by_tick(contract.episode):
         there = (frames >= 0)[:, None]
-        went = response.unanswered(torch.where(there, state[frames], torch.nan), sent.expand(len(frames), -1))
-        most = torch.maximum(most, torch.where(there, went, 0.0).amax(0))
+        sent = np.broadcast_to(sent, (len(frames), action.shape[1]))
+        went = response.unanswered(np.where(there, state[frames], np.nan), sent)
+        most = np.maximum(most, np.where(there, went, 0.0).max(0))
         sent = action[frames]
-    return most.numpy()
+    return most
 
 
 def _largest_step(contract: Contract) -> np.ndarray:

@@ -11,8 +11,9 @@ from tqdm import tqdm
 from lerobot_latentsafe.datasets.contract import Contract
 from lerobot_latentsafe.datasets.episodes import AT_ONCE, DatasetFrames
 from lerobot_latentsafe.datasets.frame_cache import FrameCache
-from lerobot_latentsafe.looks import SIDE, Look, detail, learn_looks, shrink, thumbnails
-from lerobot_latentsafe.units import TrainedOn
+from lerobot_latentsafe.limits import Limits
+from lerobot_latentsafe.looks import SIDE, Look, detail, halved, learn_looks, shrink
+from lerobot_latentsafe.units import TrainedOn, Units
 
 FRAMES = 6_000
 """Of each camera, at most: of whole episodes, as what repeats itself is learned, too. A minute's work if large."""
@@ -44,9 +45,8 @@ def looks_of(
     sample = sampled_episodes(contract.lengths)
     shown, fine = _glances(pieces, cameras, sample)
     rows = np.concatenate([np.arange(*_rows(contract, e)) for e in sample])
-    mean, std = (torch.tensor(numbers) for numbers in (trained_on.state_mean, trained_on.state_std))
-    state = (torch.from_numpy(contract.state[rows]) - mean) / std
-    return learn_looks(shown, fine, state, torch.from_numpy(contract.episode[rows]))
+    state = Limits(trained_on, Units(trained_on, [])).deviations(contract.state[rows])
+    return learn_looks(shown, fine, state, contract.episode[rows])
 
 
 def sampled_episodes(lengths: np.ndarray, most: int = FRAMES) -> list[int]:
@@ -69,16 +69,18 @@ def _cached(cache: FrameCache, cameras: list[str], begin: int, end: int) -> Iter
 
 
 @torch.no_grad()
-def _glances(pieces: Pieces, cameras: list[str], sample: list[int]) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+def _glances(
+    pieces: Pieces, cameras: list[str], sample: list[int]
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Thumbnails of each camera (N, 3, h, w), and how fine their detail is (N,), where pictures are large enough."""
-    shown: dict[str, list[Tensor]] = {key: [] for key in cameras}
-    fine: dict[str, list[Tensor]] = {key: [] for key in cameras}
+    shown: dict[str, list[np.ndarray]] = {key: [] for key in cameras}
+    fine: dict[str, list[np.ndarray]] = {key: [] for key in cameras}
     for episode in tqdm(sample, "looking through the cameras", unit="episode", leave=False):
         for piece in pieces(episode):
             for key, pictures in piece.items():
                 small = shrink(pictures.float() / 255.0)
-                shown[key].append(thumbnails(small))
+                shown[key].append(halved(small))
                 if min(pictures.shape[-2:]) >= SIDE:
                     fine[key].append(detail(small))
-    joined = ({key: torch.cat(parts) for key, parts in kept.items() if parts} for kept in (shown, fine))
+    joined = ({key: np.concatenate(parts) for key, parts in kept.items() if parts} for kept in (shown, fine))
     return next(joined), next(joined)

@@ -297,10 +297,9 @@ def _begun(infos: list[dict[str, Any]], pictures: list[np.ndarray]) -> Episodes:
 
 
 def _note_decision(runs: Episodes, decision: FilterDecision, alive: np.ndarray) -> None:
-    _record(
-        runs.traces, alive, proposed=decision.proposed, value=decision.value, margin=decision.margin,
-        intervened=decision.intervened, reason=decision.reason, heard=decision.heard,
-    )  # fmt: skip
+    columns = ("proposed", "value", "margin", "intervened", "reason", "heard")
+    known = {name: numbers for name in columns if (numbers := getattr(decision, name)) is not None}
+    _record(runs.traces, alive, **known)
     runs.overridden[alive & decision.intervened.cpu().numpy()] += 1
     moved = (decision.action - decision.proposed).norm(dim=-1).nan_to_num(0.0).cpu().numpy()
     runs.action_change[alive] += moved[alive]

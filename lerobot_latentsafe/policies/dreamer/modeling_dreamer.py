@@ -10,6 +10,7 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor
 
 from lerobot_latentsafe.datasets.clips import Clip
+from lerobot_latentsafe.host import on_host
 from lerobot_latentsafe.latent import Latent
 from lerobot_latentsafe.model_card import make_task_policy_card
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
@@ -101,7 +102,7 @@ class LatentSafeDreamerPolicy(PreTrainedPolicy):
     def _seen_commands(self, batch: dict[str, Tensor]) -> Tensor:
         """What the state shows of commands of the same name: (B, A), inside; zero of others."""
         units = self.model.units
-        shown = units.seen(self.model.state(batch))
+        shown = self.model.tensor(self.model.limits.seen(on_host(self.model.state(batch))))
         return units.normalise_action(shown.clamp(units.action_low, units.action_high)).nan_to_num(0.0)
 
     def was_overridden(self, executed: Tensor) -> None:

@@ -7,6 +7,7 @@ import threading
 from contextlib import suppress
 from typing import Any
 
+import numpy as np
 import torch
 from lerobot.robots.utils import make_robot_from_config
 from lerobot.utils.constants import OBS_IMAGES, OBS_STATE
@@ -15,6 +16,7 @@ from torch import Tensor
 from lerobot_latentsafe.datasets.decisions import Journal
 from lerobot_latentsafe.decision import FilterDecision, Reason
 from lerobot_latentsafe.guard import UnknownPoseError
+from lerobot_latentsafe.host import on_host
 from lerobot_latentsafe.modeling_latentsafe import load_filter
 from lerobot_latentsafe.robots.lerobot_events import LeRobotEvents
 from lerobot_latentsafe.robots.shielded.config_shielded import LatentSafeShieldedConfig
@@ -275,13 +277,13 @@ class LatentSafeShielded(WrappedRobot):
         Raises:
             UnknownPoseError: nobody knows what they are.
         """
-        names, units = self._trained_on.action_names, self.filter.model.units
-        told = torch.tensor([[self._sent.get(name, math.nan) for name in names]], device=units.device)
+        names, limits = self._trained_on.action_names, self.filter.model.limits
+        told = np.array([[self._sent.get(name, math.nan) for name in names]], np.float32)
         pose = self._pose()
-        shown = units.seen(torch.ones_like(pose)).isfinite()
-        unknown = units.frozen & shown & torch.where(told.isfinite(), told, units.seen(pose)).isnan()
-        held = torch.where(unknown, torch.nan, units.hold(pose, told))
-        if not held.isfinite().all():
+        shown = np.isfinite(limits.seen(np.ones_like(pose)))
+        unknown = limits.frozen & shown & np.isnan(np.where(np.isfinite(told), told, limits.seen(pose)))
+        held = np.where(unknown, np.nan, limits.hold(pose, told))
+        if not np.isfinite(held).all():
             lost = ", ".join(name for name, x in zip(names, held[0].tolist()) if not math.isfinite(x))
             raise UnknownPoseError(
                 f"{self.name} shows no usable reading of {lost}, and was told nothing yet: nobody knows what would be "
@@ -343,13 +345,12 @@ class LatentSafeShielded(WrappedRobot):
         seen = self._observation or {}
         return torch.tensor([[as_number(seen.get(name)) for name in self._trained_on.state_names]])
 
-    def _pose(self) -> Tensor:
+    def _pose(self) -> np.ndarray:
         """(1, S), the last reading of each number of the state that is believed; NaN where there is none."""
-        guard, units = self.filter.shield.guard, self.filter.model.units
-        state = self._state().to(units.device)
-        before = torch.full_like(state, math.nan) if guard.pose is None else guard.pose
-        missed = torch.zeros_like(state) if guard.missed is None else guard.missed
-        return torch.where(units.believable(state, before, missed), state, before)
+        guard, state = self.filter.shield.guard, on_host(self._state())
+        before = np.full_like(state, np.nan) if guard.pose is None else guard.pose
+        missed = np.zeros_like(state) if guard.missed is None else guard.missed
+        return np.where(self.filter.model.limits.believable(state, before, missed), state, before)
 
     def _say_once(self, message: str) -> None:
         if message not in self._said:
