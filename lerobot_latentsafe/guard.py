@@ -313,7 +313,7 @@ class Guard:
         """
         if proposed is not None and not self._is_action(proposed, hold):
             proposed, missing_reason = None, Reason.BASE_POLICY_FAILED
-        if planned is not None and not self._is_plan(planned, hold):
+        if planned is not None and not self.is_plan(planned, hold):
             proposed = planned = None
             missing_reason = Reason.BASE_POLICY_FAILED
         if proposed is None:
@@ -353,7 +353,8 @@ class Guard:
         )
         return False
 
-    def _is_plan(self, planned: Any, hold: np.ndarray) -> bool:
+    def is_plan(self, planned: Any, hold: np.ndarray | Tensor) -> bool:
+        """Whether these are actions to come (B, N, A) of robots that one action (B, A) is of; says so once if not."""
         if isinstance(planned, Tensor) and _holds_numbers(planned):
             n, size = hold.shape
             if planned.dim() == 3 and planned.shape[0] == n and planned.shape[2] == size:

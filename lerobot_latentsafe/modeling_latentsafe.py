@@ -189,9 +189,9 @@ class LatentSafePolicy(PreTrainedPolicy):
             return self._judge(batch, None, age_s, missing_reason=Reason.NO_BASE_POLICY)
         began = self.shield.clock()
         proposed, wrong = self._ask_base(batch, age_s)
-        planned = None if proposed is None else self.base.planned
+        plan = {} if proposed is None else {"planned": self.base.planned, "coming": self.base.coming}
         age_s += self.shield.clock() - began
-        decision = self._judge(batch, proposed, age_s, missing_reason=wrong, planned=planned)
+        decision = self._judge(batch, proposed, age_s, missing_reason=wrong, **plan)
         # A policy that is only late keeps its plan where the robots stayed meanwhile.
         stayed = wrong == Reason.DEADLINE_MISSED and self.shield.guard.holding.all()
         if decision.intervened.any() and not stayed:

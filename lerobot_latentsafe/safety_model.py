@@ -43,8 +43,12 @@ class LatentImagination:
 
     def step(self, latent: Latent, action: Tensor) -> Latent:
         """Next latent under actions (B, A) in [-1, 1], each held for all ticks of a step."""
+        return self.follow(latent, action.repeat(1, self.world_model.config.frame_skip))
+
+    def follow(self, latent: Latent, actions: Tensor) -> Latent:
+        """Next latent under the actions of a step's ticks, side by side (B, K A)."""
         step = self.world_model.sample_step if self.sampled else self.world_model.step
-        return step(latent, action.repeat(1, self.world_model.config.frame_skip))
+        return step(latent, actions)
 
     def features(self, latent: Latent) -> Tensor:
         """(B, D), what actor and critic read."""

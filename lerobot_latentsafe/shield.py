@@ -123,8 +123,8 @@ class Shield:
             self.overrides = Overrides(1)
             # In the thread that decides later on, as what is made at first use is made for each thread.
             seconds = None if self.patience() is None else math.inf
-            heard = self._hear(hold, self.guard.pose)
-            self._judge(Seen(images, self.guard.pose, fault), fault, heard, hold, seconds)
+            ahead = self._hear_ahead(self._hear(hold, self.guard.pose), fault)
+            self._judge(Seen(images, self.guard.pose, fault), fault, ahead, hold, seconds)
             self._warm = True
             self._forget()
 
@@ -137,6 +137,7 @@ class Shield:
         missing_reason: Reason = Reason.BASE_POLICY_FAILED,
         fault: Reason = Reason.PASSED,
         planned: Tensor | None = None,
+        coming: Tensor | None = None,
     ) -> FilterDecision:
         """Decide on one proposed action.
 
@@ -147,6 +148,7 @@ class Shield:
             missing_reason: the reason to give where there is no proposal.
             fault: what the caller has found wrong, if anything.
             planned: (B, N, A) in robot units, what is to come after `proposed`, if it was just planned.
+            coming: the same, whenever it was planned: a step of the world model hears it in place of `proposed` held.
 
         Returns:
             The decision, also kept as `self.decision`; use the one that is returned, others may decide meanwhile.
@@ -173,7 +175,8 @@ class Shield:
             # What is wrong is not judged: in its place stands what would be done instead, to stay.
             judged = np.where((faults != Reason.PASSED)[:, None], hold, clipped)
             heard = None if law.name == "guard" else self._hear(judged, self.guard.pose)
-            judgement, faults = self._judge(seen, faults, heard, hold, self.patience(len(hold)))
+            ahead = None if heard is None else self._hear_ahead(heard, faults, coming)
+            judgement, faults = self._judge(seen, faults, ahead, hold, self.patience(len(hold)))
             self.took_s = self.clock() - started
             faults = self._late(faults, age_s + self.took_s, Reason.DEADLINE_MISSED, len(hold), self.took_s)
             decision = self._decide(judgement, seen, faults, hold, wanted, clipped)
@@ -212,9 +215,9 @@ class Shield:
         return faults if in_time else or_else(faults, reason)
 
     def _judge(
-        self, seen: Seen, faults: np.ndarray, heard: Tensor | None, hold: np.ndarray, seconds: float | None
+        self, seen: Seen, faults: np.ndarray, ahead: Tensor | None, hold: np.ndarray, seconds: float | None
     ) -> tuple[Judgement, np.ndarray]:
-        """What the world model says of actions as it hears them (B, A), and the faults with its own.
+        """What the world model says of the actions of a step as it hears them (B, K, A), and the faults with its own.
 
         A world model that has not answered after so many seconds, or that failed, has missed a frame. So it remembers
         nothing, and the next tick begins with what it sees.
@@ -224,7 +227,7 @@ class Shield:
         if self.model.config.law.name == "guard":
             return unknown, faults
         try:
-            return self._in_time(lambda: self._imagine(seen, faults, heard, hold), seconds)
+            return self._in_time(lambda: self._imagine(seen, faults, ahead, hold), seconds)
         except TimeoutError as e:
             self.note_failure("the filter was late", e)
             reason = Reason.DEADLINE_MISSED
@@ -233,20 +236,20 @@ class Shield:
             reason = Reason.FILTER_FAILED
         return unknown, or_else(faults, reason)
 
-    def _imagine(self, seen: Seen, faults: np.ndarray, heard: Tensor, hold: np.ndarray) -> tuple[Judgement, np.ndarray]:
+    def _imagine(self, seen: Seen, faults: np.ndarray, ahead: Tensor, hold: np.ndarray) -> tuple[Judgement, np.ndarray]:
         """Take in what is seen, and look ahead; changes nothing here, as it may be late."""
         percepts = self.model.world_model.perceive(seen.images)
         unsound = ~is_sound(percepts)
         blind = self.model.tensor(np.isin(faults, UNSEEN)) | (self.model.tensor(faults == Reason.PASSED) & unsound)
-        belief = self._filter_history(percepts, seen.state, heard, blind)
-        judgement = Judgement(belief, *self._look_ahead(belief.latent, heard, hold))
+        belief = self._filter_history(percepts, seen.state, ahead[:, 0], blind)
+        judgement = Judgement(belief, *self._look_ahead(belief.latent, ahead, hold))
         return judgement, or_else(faults, first_of({Reason.FILTER_FAILED: on_host(unsound, torch.bool)}))
 
-    def _look_ahead(self, latent: Latent, heard: Tensor, hold: np.ndarray) -> tuple[np.ndarray, ...]:
-        """V of an action and l now (B,); the fallback (B, A); whether an override would be the retreat's (B,)."""
+    def _look_ahead(self, latent: Latent, ahead: Tensor, hold: np.ndarray) -> tuple[np.ndarray, ...]:
+        """V of actions (B, K, A) and l now (B,); the fallback (B, A); whether an override would be the retreat's (B,)."""
         model = self.model
         margin = model.imagination.margin(latent)
-        predicted, on_the_way = self._go_on(latent, heard)
+        predicted, on_the_way = self._go_on(latent, ahead)
         both = {key: torch.cat([predicted[key], latent[key]]) for key in latent}  # one pass through imagination
         sizes = [len(on_the_way), len(hold)]
         (value, here), (_, action) = (part.split(sizes) for part in model.plan(both))
@@ -309,6 +312,22 @@ class Shield:
         model = self.model
         at = model.tensor(pose) if model.units.has_targets else None
         return model.units.heard_action(model.tensor(action), at).nan_to_num(0.0)
+
+    def _hear_ahead(self, heard: Tensor, faults: np.ndarray, coming: Tensor | None = None) -> Tensor:
+        """The actions of a step of the world model (B, K, A): one that is judged (B, A), and after it what is to come.
+
+        It is held where nothing is known to come (B, N, A), where something is wrong, and of targets, which mean nothing
+        without the states to come.
+        """
+        model = self.model
+        ahead = heard[:, None].repeat(1, model.config.world_model.frame_skip, 1)
+        if coming is None or model.limits.has_targets or not self.guard.is_plan(coming, heard):
+            return ahead
+        then = model.units.heard_action(model.place(coming[:, : ahead.shape[1] - 1]).float())
+        follows = then.isfinite().all(-1).cumprod(1).bool() & model.tensor(faults == Reason.PASSED)[:, None]
+        for t in range(then.shape[1]):
+            ahead[:, t + 1 :] = torch.where(follows[:, t, None], then[:, t], ahead[:, t])[:, None]
+        return ahead
 
     def note_failure(self, what: str, error: BaseException) -> None:
         """Count a failure that a decision survived; its trace is logged the first time."""
@@ -412,18 +431,19 @@ class Shield:
         n_frames = self.model.config.world_model.steps(self.model.config.law.history_frames)
         return self.beliefs[0].after(observe, n_frames)
 
-    def _go_on(self, latent: Latent, action: Tensor) -> tuple[Latent, Tensor]:
-        """N x B latents after `proposal_steps` ticks of the action (B, A), and the least margin until there (N x B,).
+    def _go_on(self, latent: Latent, ahead: Tensor) -> tuple[Latent, Tensor]:
+        """N x B latents after `proposal_steps` ticks, and the least margin until there (N x B,).
 
-        N is 1, or the number of samples that are drawn of each robot's future.
+        N is 1, or the number of samples that are drawn of each robot's future. The first step hears its actions
+        (B, K, A), those after it the last of these, held.
         """
         law, imagination = self.model.config.law, self.model.imagination
         n = max(1, law.samples)
-        action = action.repeat(n, 1)
+        action, held = ahead.flatten(1).repeat(n, 1), ahead[:, -1].repeat(n, ahead.shape[1])
         latent = map_latent(latent, lambda t: t.repeat(n, *[1] * (t.dim() - 1)))
         least = torch.full_like(action[:, 0], torch.inf)
         for _ in range(self.model.config.world_model.steps(law.proposal_steps)):
-            latent = imagination.step(latent, action)
+            latent, action = imagination.follow(latent, action), held
             least = torch.minimum(least, imagination.margin(latent))
         return latent, least
 

@@ -64,6 +64,32 @@ def test_ticks_of_the_law_are_steps_of_the_model(skipping, monkeypatch, ticks, s
     assert taken == [SKIP * tiny.ACTION_DIM] * (1 + steps)  # one to take in what is seen
 
 
+def test_a_step_hears_what_is_to_come_and_holds_what_is_not_known(skipping, monkeypatch):
+    """Of a chunk two actions are heard beside the proposal, of a shorter one the last for the rest of the step."""
+    policy = load_filter(skipping, law=LawOptions(proposal_steps=SKIP, lookahead=0))
+    seen, heard, step = tiny.observation(np.array([[-0.9, 0.1, 0.0]])), [], type(policy.model.world_model).step
+    monkeypatch.setattr(type(policy.model.world_model), "step", lambda self, z, a: heard.append(a) or step(self, z, a))
+    first, second, third = (torch.tensor([[turn, 1.0]]) for turn in (0.1, -0.2, 0.3))
+    unknown, far = torch.full_like(first, torch.nan), torch.full_like(first, 99.0)
+    table = (
+        (None, (first, first, first)),
+        ([second, third, far], (first, second, third)),
+        ([second], (first, second, second)),
+        ([unknown, third], (first, first, first)),
+    )
+    for coming, expected in table:
+        policy.reset()
+        heard[:] = []
+        coming = None if coming is None else torch.stack(coming, 1)
+        policy.shield(seen, first, coming=coming)
+        wanted = policy.model.units.heard_action(torch.stack(expected, 1)).flatten(1)
+        torch.testing.assert_close(heard[1][:1], wanted)
+    policy.reset()
+    heard[:] = []
+    policy.shield(seen, far, coming=torch.stack([second, third], 1))  # what is wrong is not judged, but to stay
+    assert torch.equal(heard[1][0, : tiny.ACTION_DIM], heard[1][0, -tiny.ACTION_DIM :])
+
+
 def test_episodes_shorter_than_a_step_are_refused(cache_meta):
     with pytest.raises(ValueError, match=r"frame_skip is 1000, and the longest episode has \d+ frames"):
         tiny.new_policy(cache_meta, world_model=tiny.rssm_config(frame_skip=1000))
