@@ -181,11 +181,8 @@ class Shield:
             faults = self._late(faults, age_s + self.took_s, Reason.DEADLINE_MISSED, len(hold), self.took_s)
             decision = self._decide(judgement, seen, faults, hold, wanted, clipped)
             self._remember(judgement, decision, observation)
-            decision.heard = heard
-            decision = decision.to(self.model.device)
-            self.decision = replace(
-                decision, action=decision.action.clone()
-            )  # what is returned is the caller's to change
+            decision = replace(decision, heard=heard).to(self.model.device)
+            self.decision = replace(decision, action=decision.action.clone())  # what is returned is the caller's
             return decision
 
     def _say_if_disarmed(self) -> None:
@@ -246,7 +243,7 @@ class Shield:
         return judgement, or_else(faults, first_of({Reason.FILTER_FAILED: on_host(unsound, torch.bool)}))
 
     def _look_ahead(self, latent: Latent, ahead: Tensor, hold: np.ndarray) -> tuple[np.ndarray, ...]:
-        """V of actions (B, K, A) and l now (B,); the fallback (B, A); whether an override would be the retreat's (B,)."""
+        """V of actions (B, K, A), l now (B,); the fallback (B, A); whether an override would be the retreat's (B,)."""
         model = self.model
         margin = model.imagination.margin(latent)
         predicted, on_the_way = self._go_on(latent, ahead)
@@ -316,8 +313,8 @@ class Shield:
     def _hear_ahead(self, heard: Tensor, faults: np.ndarray, coming: Tensor | None = None) -> Tensor:
         """The actions of a step of the world model (B, K, A): one that is judged (B, A), and after it what is to come.
 
-        It is held where nothing is known to come (B, N, A), where something is wrong, and of targets, which mean nothing
-        without the states to come.
+        It is held where nothing is known to come (B, N, A), where something is wrong, and of targets, which mean
+        nothing without the states to come.
         """
         model = self.model
         ahead = heard[:, None].repeat(1, model.config.world_model.frame_skip, 1)
