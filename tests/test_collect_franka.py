@@ -117,7 +117,7 @@ class Closes:
 
     up = 0.9
     """More than the limits allow."""
-    planned = None
+    planned = coming = None
 
     def __init__(self):
         self.executed = []

@@ -65,7 +65,7 @@ class Still(BasePolicy):
     """A base policy that does not move, with the gripper open."""
 
     def __init__(self):
-        self.planned = None
+        self.planned = self.coming = None
 
     def reset(self):
         pass
