@@ -386,6 +386,7 @@ def test_the_papers_sizes_train_save_load_and_stream(tmp_path):
         ({"clip_length": 3}, "clip_length is 3.*history=3 frames needs at least 4"),
         ({"history": 0}, "history is 0.*at least 1"),
         ({"frame_percept": "cls"}, "'cls'; expected one of components, class"),
+        ({"memory": -1}, "memory is -1.*0 .none."),
         ({"head_dim": 7}, "head_dim is 7.*even"),
         ({"conditioning": "concat", "embedding": 16}, "dim is 32.*embedding=16"),
     ],

@@ -84,6 +84,11 @@ def test_a_step_hears_what_is_to_come_and_holds_what_is_not_known(skipping, monk
         policy.shield(seen, first, coming=coming)
         wanted = policy.model.units.heard_action(torch.stack(expected, 1)).flatten(1)
         torch.testing.assert_close(heard[1][:1], wanted)
+    for wrong in (torch.zeros(1, 2, 7), torch.zeros(2, 2, tiny.ACTION_DIM), first, [[0.0, 1.0]]):
+        policy.reset()
+        heard[:] = []
+        policy.shield(seen, first, coming=wrong)
+        torch.testing.assert_close(heard[1][:1], policy.model.units.heard_action(first).repeat(1, SKIP))
     policy.reset()
     heard[:] = []
     policy.shield(seen, far, coming=torch.stack([second, third], 1))  # what is wrong is not judged, but to stay

@@ -113,6 +113,8 @@ class DinoWMConfig(WorldModelConfig):
             raise ValueError(f"head_dim is {self.head_dim}; the rotary embedding turns pairs, give an even number")
         if self.conditioning == "concat" and self.dim <= 2 * self.embedding:
             raise ValueError(f"dim is {self.dim}; twice embedding={self.embedding} of it leave nothing for the tokens")
+        if self.memory < 0:
+            raise ValueError(f"memory is {self.memory}; expected 0 (none) or the numbers that a frame token remembers")
         if self.merge_patches < 1:
             raise ValueError(f"merge_patches is {self.merge_patches}; expected 1 (as they are) or more")
 
