@@ -66,8 +66,8 @@ def test_without_new_actions_the_arm_holds(robot, clock, caplog):
     robot.driver.follow, clock.runs = 0.01, True
     with caplog.at_level(logging.WARNING):
         robot.send_action(STILL | {"delta_y.pos": 0.03})
-        wait_for(lambda: "holding" in caplog.text)
-    assert robot._stream.target()[0][1] < 0.02
+        wait_for(lambda: robot._stream._holds)  # the log comes first, then the arm is asked where it is
+    assert "holding" in caplog.text and robot._stream.target()[0][1] < 0.02
 
 
 def test_the_gripper_moves_when_the_wish_changes(robot):
