@@ -1,6 +1,6 @@
 """Clips for world-model training, from LeRobot batches or from a frame cache: the same windows either way."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -40,6 +40,11 @@ class Clip:
     valid: Tensor
     failure: Tensor
     terminal: Tensor
+
+    def rows(self, some: slice) -> "Clip":
+        """Some of the clips."""
+        cut = {name: values[some] for name, values in self.percepts.items()}
+        return Clip(cut, *(getattr(self, field.name)[some] for field in fields(self)[1:]))
 
 
 class Eyes(Protocol):

@@ -12,9 +12,9 @@ next hardly anything changes, and texture that nothing can predict drowns what t
 * the rest of each clip is imagined from its start (open loop);
 * a step of the model is several ticks of the robot (`frame_skip`);
 * a frame token carries the principal components of the whole frame, and most of the loss weighs on it;
-* a recurrent memory of the frame tokens tells all layers what happened before, and the frame token what comes next;
+* a recurrent memory of the frame tokens tells all layers what happened before, and foretells the frame token by itself;
 * the other tokens carry what these leave unsaid, as principal components of a patch, four patches side by side
-  (`merge_patches`).
+  (`merge_patches`); a part of the clips is enough to learn them from (`token_share`).
 """
 
 import math
@@ -67,6 +67,8 @@ class DinoWMConfig(WorldModelConfig):
             of each camera (`class`), of an encoder that has them: DINOv2 and DINOv3 do, efficientnet_lite0 does not.
         memory: width of the recurrent memory that a frame token has; 0: none, what was before is in keys and values
             alone.
+        token_share: share of a batch's clips whose patches are predicted. The others teach the memory and the frame
+            token, and the margin what these tell by themselves; they cost a tenth.
         token_weight, frame_weight: of the errors of patches, and of the frame token.
         blind: see no images, only proprioception: the control that a model which looks must beat.
     """
@@ -92,6 +94,7 @@ class DinoWMConfig(WorldModelConfig):
     frame_token: bool = True
     frame_percept: str = "components"
     memory: int = 256
+    token_share: float = 0.25
     token_weight: float = 0.1
     frame_weight: float = 1.0
     blind: bool = False
@@ -115,6 +118,8 @@ class DinoWMConfig(WorldModelConfig):
             raise ValueError(f"dim is {self.dim}; twice embedding={self.embedding} of it leave nothing for the tokens")
         if self.memory < 0:
             raise ValueError(f"memory is {self.memory}; expected 0 (none) or the numbers that a frame token remembers")
+        if not 0 < self.token_share <= 1:
+            raise ValueError(f"token_share is {self.token_share}; expected a share of the clips, above 0 and up to 1")
         if self.merge_patches < 1:
             raise ValueError(f"merge_patches is {self.merge_patches}; expected 1 (as they are) or more")
 
@@ -229,7 +234,8 @@ class DinoWM(TerminationHead):
         self.sizes = {"tokens": (n_tokens, token_dim), "state": (state_dim,), "context": (n_context,)}
         self.sizes["action"] = (action_dim,)
         if config.frame_token:
-            self.frame_decoder = _change_decoder(d + n_frame + n_told, 2, n_frame + state_dim, n_context)
+            n_known = n_told + n_frame + (0 if self.memory_dim else d)
+            self.frame_decoder = _change_decoder(n_known, 2, n_frame + state_dim, n_context)
             self.sizes["vector"] = (n_frame,)
             self.feature_dim += n_frame
         else:
@@ -289,9 +295,12 @@ class DinoWM(TerminationHead):
         return {**latent, "seen": seen, **dict(zip(self.past_names, past))}
 
     def step(self, latent: Latent, action: Tensor) -> Latent:
-        """Next latent under actions (B, A), from the frame and the H - 1 before it."""
-        past = [latent[name] for name in self.past_names]
-        now = {name: latent[name][:, None] for name in self.seen_names}
+        """Next latent under actions (B, A), from the frame and the H - 1 before it.
+
+        With a memory a latent may lack tokens and past: then what follows does, too.
+        """
+        past = [latent[name] for name in self.past_names if name in latent]
+        now = {name: latent[name][:, None] for name in self.seen_names if name in latent}
         ahead = self._advance(now, action[:, None], latent["seen"][:, None], past, latent["context"])
         return self._next_latent(ahead, 0, latent["seen"], action)
 
@@ -300,9 +309,13 @@ class DinoWM(TerminationHead):
         return {**predicted, **self._looked_at(percepts), "state": state}
 
     def features(self, latent: Latent) -> Tensor:
-        """Summary of the tokens, context, state and what the frame token carries side by side: (..., D)."""
-        frame = [latent["vector"]] if self.config.frame_token else []
-        return torch.cat([self.summary(latent["tokens"]), latent["context"], latent["state"], *frame], -1)
+        """Summary of the tokens (0 of none), context, state and what the frame token carries side by side: (..., D)."""
+        frame, context = [latent["vector"]] if self.config.frame_token else [], latent["context"]
+        if "tokens" in latent:
+            summary = self.summary(latent["tokens"])
+        else:
+            summary = context.new_zeros(*context.shape[:-1], 2 * self.config.summary)
+        return torch.cat([summary, context, latent["state"], *frame], -1)
 
     def tokens_of(self, latent: Latent) -> Tensor | None:
         """Whole tokens (B, patches, cameras x dim) that lie nearest to the data's mean and have what the latent tells.
@@ -360,25 +373,26 @@ class DinoWM(TerminationHead):
         """One step ahead of each of T frames, under the actions taken there.
 
         Args:
-            frames: tokens (B, T, P, C), state (B, T, S) and perhaps vector (B, T, F).
+            frames: tokens (B, T, P, C), state (B, T, S) and perhaps vector (B, T, F); with a memory, tokens may lack.
             action: (B, T, A).
             seen: (B, T), and past: as in the transformer.
             context: (B, M), of the first of them; None if nothing was before.
         """
         state, known = frames["state"], (seen > 0)[..., None]
         told = [state, action, *self._remembered(frames, action, seen, context)]
-        x, condition = self._embed(frames, told)
-        x, kept = self.transformer(x, seen, past, condition)
-        patches = x[..., : frames["tokens"].shape[-2], :]
-        told = told if self.memory_dim else [*told, x.mean(-2)]
-        ahead = {
-            "tokens": frames["tokens"] + torch.cat([decoder(patches) for decoder in self.decoders], -1),
-            # Of a first frame nothing was known before; what the empty latent led to must not say otherwise.
-            "context": told[-1] * known,
-        }
+        ahead, kept, frame = {}, [], []
+        if "tokens" in frames:
+            x, condition = self._embed(frames, told)
+            x, kept = self.transformer(x, seen, past or None, condition)
+            patches = x[..., : frames["tokens"].shape[-2], :]
+            ahead["tokens"] = frames["tokens"] + torch.cat([decoder(patches) for decoder in self.decoders], -1)
+            if not self.memory_dim:
+                frame, told = [x[..., -1, :]], [*told, x.mean(-2)]
+        # Of a first frame nothing was known before; what the empty latent led to must not say otherwise.
+        ahead["context"] = told[-1] * known
         if not self.config.frame_token:
             return _Ahead({**ahead, "state": state + self.state_decoder(torch.cat(told, -1))}, kept)
-        change = self.frame_decoder(torch.cat([x[..., -1, :], frames["vector"], *told], -1))
+        change = self.frame_decoder(torch.cat([*frame, frames["vector"], *told], -1))
         vector, moved = change.split([frames["vector"].shape[-1], state.shape[-1]], -1)
         return _Ahead({**ahead, "vector": frames["vector"] + vector, "state": state + moved}, kept)
 
@@ -427,10 +441,31 @@ class DinoWM(TerminationHead):
         The features are those of latents seen and, from where imagination took over, of latents imagined. Episodes
         begin at the first frame of a clip, if anywhere in it.
         """
-        frames = {**self._looked_at(clip.percepts), "state": clip.state}
+        n_clips, length = clip.state.shape[:2]
+        last = self._last_observed(clip) if self.config.open_loop > 0 else length - 2
+        shown = math.ceil(self._token_share * n_clips)
+        losses, metrics, features = clip.state.new_zeros(()), {}, []
+        for part, names in ((slice(0, shown), self.seen_names), (slice(shown, n_clips), self.seen_names[1:])):
+            if part.start == n_clips:
+                continue
+            error, seen_features, told = self._part_loss(clip.rows(part), names, last)
+            losses = losses + error * (part.stop - part.start) / n_clips
+            features.append(seen_features)
+            metrics = told | metrics
+        features = torch.cat(features)
+        return losses + self.end_loss(features, clip), features, metrics
+
+    @property
+    def _token_share(self) -> float:
+        """Without a memory, what follows a frame is not known without its patches."""
+        return self.config.token_share if self.memory_dim else 1.0
+
+    def _part_loss(self, clip: Clip, names: list[str], last: int) -> tuple[Tensor, Tensor, dict[str, float]]:
+        """Loss, features and metrics of clips of which `names` are predicted, and which are seen up to frame `last`."""
+        looked = {**self._looked_at(clip.percepts), "state": clip.state}
+        frames = {name: looked[name] for name in names}
         seen, length = self._frames_seen(clip.is_first), clip.state.shape[1]
         goes_on = clip.valid[:, 1:] & clip.valid[:, :-1] & ~clip.is_first[:, 1:]
-        last = self._last_observed(clip) if self.config.open_loop > 0 else length - 2
         known = slice(0, last + 1)
         ahead = self._advance({k: v[:, known] for k, v in frames.items()}, clip.action[:, 1 : last + 2], seen[:, known])
         unit = self._unit_of_change(frames, goes_on)
@@ -445,13 +480,11 @@ class DinoWM(TerminationHead):
             losses = self._errors(imagined, frames, alive, slice(last, last + 1), unit)
             metrics |= {f"loss_{name}_open_loop": value.item() for name, value in losses.items()}
             loss = loss + self.config.open_loop * sum(losses.values())
-            for name in self.seen_names:
-                truth = frames[name]
+            for name, truth in frames.items():
                 ahead_of_last = torch.where(_like(alive, truth), imagined[name], truth[:, last + 1 :])
                 frames[name] = torch.cat([truth[:, known], ahead_of_last], 1)
             context = torch.cat([context[:, known], imagined["context"]], 1)
-        features = self.features({**frames, "context": context})
-        return loss + self.end_loss(features, clip), features, metrics
+        return loss, self.features({**frames, "context": context}), metrics
 
     def _frames_seen(self, is_first: Tensor) -> Tensor:
         """How many frames each may look at, itself included, at most H: (B, T)."""
@@ -477,7 +510,7 @@ class DinoWM(TerminationHead):
 
     def _unit_of_change(self, frames: dict[str, Tensor], goes_on: Tensor) -> dict[str, Tensor]:
         """Mean squared change from one frame to the next, of each camera's tokens (cameras,), of the rest ()."""
-        change = {name: torch.diff(frames[name], dim=1) for name in self.seen_names}
+        change = {name: torch.diff(value, dim=1) for name, value in frames.items()}
         change = {
             name: self._by_camera(value).mean(-2) if name == "tokens" else _mean_square(value)
             for name, value in change.items()
@@ -497,14 +530,15 @@ class DinoWM(TerminationHead):
             since: the frames, N or one, since which a token's change makes it weigh.
         """
         config, n = self.config, predicted["state"].shape[1]
-        truth = {name: frames[name][:, -n:] for name in self.seen_names}
+        truth = {name: value[:, -n:] for name, value in frames.items()}
         errors = {"state": _mean(_mean_square(predicted["state"] - truth["state"]), counts) / unit["state"]}
         if config.blind:
             return errors
-        error = self._by_camera(predicted["tokens"] - truth["tokens"])
-        if config.change_weight > 0:
-            error = error * self._weight(self._by_camera(truth["tokens"] - frames["tokens"][:, since]), counts)
-        errors["tokens"] = config.token_weight * (_mean(error.mean(-2), counts) / unit["tokens"]).mean()
+        if "tokens" in frames:
+            error = self._by_camera(predicted["tokens"] - truth["tokens"])
+            if config.change_weight > 0:
+                error = error * self._weight(self._by_camera(truth["tokens"] - frames["tokens"][:, since]), counts)
+            errors["tokens"] = config.token_weight * (_mean(error.mean(-2), counts) / unit["tokens"]).mean()
         if config.frame_token:
             error = _mean_square(predicted["vector"] - truth["vector"])
             errors["frame"] = config.frame_weight * _mean(error, counts) / unit["vector"]
