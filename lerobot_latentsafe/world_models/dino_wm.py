@@ -444,16 +444,16 @@ class DinoWM(TerminationHead):
         n_clips, length = clip.state.shape[:2]
         last = self._last_observed(clip) if self.config.open_loop > 0 else length - 2
         shown = math.ceil(self._token_share * n_clips)
-        losses, metrics, features = clip.state.new_zeros(()), {}, []
-        for part, names in ((slice(0, shown), self.seen_names), (slice(shown, n_clips), self.seen_names[1:])):
-            if part.start == n_clips:
-                continue
-            error, seen_features, told = self._part_loss(clip.rows(part), names, last)
-            losses = losses + error * (part.stop - part.start) / n_clips
-            features.append(seen_features)
-            metrics = told | metrics
-        features = torch.cat(features)
-        return losses + self.end_loss(features, clip), features, metrics
+        parts = [(slice(0, shown), self.seen_names), (slice(shown, n_clips), self.seen_names[1:])][
+            : 1 + (shown < n_clips)
+        ]
+        done = [self._part_loss(clip.rows(part), names, last) for part, names in parts]
+        loss = sum(
+            ((part.stop - part.start) / n_clips * error for (part, _), (error, _, _) in zip(parts, done)),
+            clip.state.new_zeros(()),
+        )
+        features = torch.cat([each for _, each, _ in done])
+        return loss + self.end_loss(features, clip), features, done[0][2]
 
     @property
     def _token_share(self) -> float:
@@ -472,14 +472,14 @@ class DinoWM(TerminationHead):
         begun = {name: value[:, : last + 2] for name, value in frames.items()}
         losses = self._errors(ahead.frames, begun, goes_on[:, known], slice(0, -1), unit)
         metrics = {f"loss_{name}": value.item() for name, value in losses.items()}
-        loss = (last + 1) / (length - 1) * sum(losses.values())
+        loss = (last + 1) / (length - 1) * torch.stack(list(losses.values())).sum()
         context = F.pad(ahead.frames["context"], (0, 0, 1, 0)) * (seen[:, : last + 2] > 1)[..., None]
         if self.config.open_loop > 0:
             imagined = self._imagine(ahead, clip, seen, last)
             alive = goes_on[:, last:].cumprod(1).bool()
             losses = self._errors(imagined, frames, alive, slice(last, last + 1), unit)
             metrics |= {f"loss_{name}_open_loop": value.item() for name, value in losses.items()}
-            loss = loss + self.config.open_loop * sum(losses.values())
+            loss = loss + self.config.open_loop * torch.stack(list(losses.values())).sum()
             for name, truth in frames.items():
                 ahead_of_last = torch.where(_like(alive, truth), imagined[name], truth[:, last + 1 :])
                 frames[name] = torch.cat([truth[:, known], ahead_of_last], 1)
