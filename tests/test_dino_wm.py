@@ -307,6 +307,27 @@ def test_every_parameter_of_the_recipe_learns():
         assert {"loss_frame", "loss_frame_open_loop"} <= metrics.keys()
 
 
+@torch.no_grad()
+def test_a_part_of_the_clips_teaches_the_patches_and_all_teach_the_frame():
+    """Whichever clips show their patches, each frame token is foretold as if all did."""
+    part, whole = build_merged(token_share=0.25), build_merged(token_share=1.0)
+    whole.load_state_dict(part.state_dict())
+    clip = merged_clip(batch=8)
+    (_, some, told), (_, all_of_them, _) = part.eval().loss(clip), whole.eval().loss(clip)
+    assert some.shape == all_of_them.shape == (8, 8, part.feature_dim) and "loss_tokens" in told
+    torch.testing.assert_close(some[:2], all_of_them[:2])  # 2 of 8 clips
+    n = 2 * part.config.summary  # what is learned of patches comes first
+    torch.testing.assert_close(some[2:, :, n:], all_of_them[2:, :, n:])
+    assert not some[2:, :, :n].any() and all_of_them[2:, :, :n].any()
+
+
+def test_without_a_memory_all_clips_show_their_patches():
+    for options in ({"memory": 0}, {"frame_token": False}):
+        model = build_merged(token_share=0.1, **options).eval()
+        _, features, _ = model.loss(merged_clip())
+        assert features[..., : 2 * model.config.summary].abs().sum((1, 2)).all()
+
+
 def test_a_grid_that_does_not_fall_into_squares_is_refused():
     with pytest.raises(ValueError, match="9 patches a camera: 2 x 2 of them do not fill"):
         build(merge_patches=2)
@@ -387,6 +408,8 @@ def test_the_papers_sizes_train_save_load_and_stream(tmp_path):
         ({"history": 0}, "history is 0.*at least 1"),
         ({"frame_percept": "cls"}, "'cls'; expected one of components, class"),
         ({"memory": -1}, "memory is -1.*0 .none."),
+        ({"token_share": 0.0}, "token_share is 0.0.*above 0"),
+        ({"token_share": 1.5}, "token_share is 1.5.*up to 1"),
         ({"head_dim": 7}, "head_dim is 7.*even"),
         ({"conditioning": "concat", "embedding": 16}, "dim is 32.*embedding=16"),
     ],
