@@ -1,5 +1,6 @@
 """The failure margin l: a classifier on latent features whose zero-sublevel set is the failure set (Eq. 3)."""
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -19,6 +20,7 @@ class MarginConfig:
         delta: delta of Eq. 3.
         weight: weight of Eq. 3 in the training loss; 0 leaves the margin to `latentsafe train-margin`.
         clips: windows of the data that `latentsafe train-margin` fits the margin to.
+        noise: of the features meanwhile, in standard deviations: the more of them, the more.
         failure_specification: name of the failure labels: a dataset column or a sidecar file.
     """
 
@@ -27,11 +29,14 @@ class MarginConfig:
     delta: float = 0.75
     weight: float = 10.0
     clips: int = 10_000
+    noise: float = 0.5
     failure_specification: str = "failure"
 
     def __post_init__(self) -> None:
         if self.delta <= 0:
             raise ValueError(f"--policy.margin.delta is {self.delta}; expected a positive number")
+        if not 0 <= self.noise < math.inf:
+            raise ValueError(f"--policy.margin.noise is {self.noise}; expected standard deviations, 0 or more")
 
 
 class FailureMargin(nn.Module):

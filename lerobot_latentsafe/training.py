@@ -125,7 +125,7 @@ def train_margin(path: str | Path, dataset_meta, output_dir: Path, seed: int = 0
         model, config, started = policy.model, policy.config, time.process_time()
         features, failure = seen_and_imagined(model, reader, config.margin.clips, generator)
         model.margin = model.new_margin()
-        fit_margin(model.margin, features, failure, config.margin.delta, generator)
+        fit_margin(model.margin, features, failure, config.margin.delta, generator, noise=config.margin.noise)
         config.change(trained_on=replace(config.trained_on, stage="world_model"), frame_cache=None)
         _save(policy, model.margin, folder, run)
     print(f"margin: {time.process_time() - started:.0f} CPU-s")

@@ -234,7 +234,8 @@ class DinoWM(TerminationHead):
         self.sizes = {"tokens": (n_tokens, token_dim), "state": (state_dim,), "context": (n_context,)}
         self.sizes["action"] = (action_dim,)
         if config.frame_token:
-            n_known = n_told + n_frame + (0 if self.memory_dim else d)
+            # With a memory, that must carry what the action does: so it learns what margin and critic need, too.
+            n_known = n_told + n_frame + (-self.action_dim if self.memory_dim else d)
             self.frame_decoder = _change_decoder(n_known, 2, n_frame + state_dim, n_context)
             self.sizes["vector"] = (n_frame,)
             self.feature_dim += n_frame
@@ -392,7 +393,8 @@ class DinoWM(TerminationHead):
         ahead["context"] = told[-1] * known
         if not self.config.frame_token:
             return _Ahead({**ahead, "state": state + self.state_decoder(torch.cat(told, -1))}, kept)
-        change = self.frame_decoder(torch.cat([*frame, frames["vector"], *told], -1))
+        told = [state, told[-1]] if self.memory_dim else [*frame, *told]
+        change = self.frame_decoder(torch.cat([frames["vector"], *told], -1))
         vector, moved = change.split([frames["vector"].shape[-1], state.shape[-1]], -1)
         return _Ahead({**ahead, "vector": frames["vector"] + vector, "state": state + moved}, kept)
 
