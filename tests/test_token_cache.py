@@ -220,6 +220,16 @@ def test_whole_tokens_are_cut_down_to_the_components_that_are_read(component_roo
     torch.testing.assert_close(model.basis(model.tokens_of(latent)), cached["vector"], rtol=1e-2, atol=1e-2)
 
 
+@torch.inference_mode()
+def test_tokens_are_cut_down_where_nothing_is_learned(component_root):
+    """Tensors made under inference_mode do not count their changes."""
+    model = dino_wm_of(component_root)
+    perception = model._perception[0]
+    size = perception.encoder.dim * len(perception.image_keys)
+    tokens = torch.randn(2, perception.n_patches, size)
+    assert perception.cut_down(tokens).shape == (2, perception.n_patches, perception.token_dim)
+
+
 @pytest.mark.parametrize("kind", tiny.DINO)
 def test_a_frame_token_of_class_tokens_is_cached_trained_and_seen(kind, dataset, tmp_path):
     encoder = tiny.save_dino(tmp_path / "dino", kind)

@@ -354,7 +354,8 @@ class Perception(nn.Module):
         A tick would else lift each frame, which reads as many numbers as all its components have weights.
         """
         parts = self.basis.axes, self.basis.mean, self.patches.axes, self.patches.mean
-        state = [(part.data_ptr(), part._version) for part in parts]  # they are loaded, or moved, from time to time
+        # They are loaded, or moved, from time to time; those made under inference_mode do not say how often.
+        state = [(part.data_ptr(), 0 if part.is_inference() else part._version) for part in parts]
         if self._known[0] != state:
             n_components = self.basis.axes.shape[1]
             one_each = torch.eye(n_components, device=parts[0].device, dtype=parts[0].dtype)
