@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -16,12 +17,14 @@ from test_train import lerobot_train
 
 from lerobot_latentsafe.cli import main as latentsafe
 from lerobot_latentsafe.encoders.patch_encoders import EncoderError, load_encoder
+from lerobot_latentsafe.evaluation.rollouts import PolicyActor
 from lerobot_latentsafe.experiments.bag import demo, demo_filter, out_of_distribution, policies, runs
 from lerobot_latentsafe.experiments.demo import Demo
-from lerobot_latentsafe.experiments.scene_world import SceneWorld
+from lerobot_latentsafe.experiments.scene_world import OperatorActor, SceneWorld
 from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES, action_limits
 from lerobot_latentsafe.franka.bag import BagScene
 from lerobot_latentsafe.franka.scenes import SCENES
+from lerobot_latentsafe.guard import standing_still
 from lerobot_latentsafe.modeling_latentsafe import load_filter
 from lerobot_latentsafe.reports.html import PRINTED
 
@@ -182,3 +185,12 @@ def test_a_command_that_fails_shows_the_end_of_its_log(tmp_path, capsys):
     )
     with pytest.raises(SystemExit, match=r"(?s)'break' failed.*ZeroDivisionError"):
         shown.run("break", "python", "-c", "1 / 0")
+
+
+def test_a_simulation_waits_for_whoever_decides_in_it(filter_path):
+    """On a busy machine a decision takes long, and that is no fault of the filter that is measured."""
+    policy = load_filter(filter_path)
+    for actor in (lambda: PolicyActor(policy), lambda: OperatorActor(iter([]), policy)):
+        policy.shield.clock = time.perf_counter
+        actor()
+        assert policy.shield.patience() is None and policy.shield.clock is standing_still

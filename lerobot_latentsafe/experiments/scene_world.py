@@ -10,6 +10,7 @@ from torch import Tensor
 from lerobot_latentsafe.evaluation.rollouts import Choice
 from lerobot_latentsafe.franka.behaviors import Actions
 from lerobot_latentsafe.franka.scene import CAMERAS
+from lerobot_latentsafe.guard import standing_still
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 
 FRONT = "observation.images.front"
@@ -79,6 +80,7 @@ class OperatorActor:
         self.operator, self.filter = operator, filter
         self.action: np.ndarray = np.zeros(7)
         if filter is not None:
+            filter.shield.clock = standing_still  # the simulation waits for what is decided
             filter.reset()
 
     def __call__(self, batch: dict[str, Tensor]) -> Choice:
