@@ -94,7 +94,7 @@ class DinoWMConfig(WorldModelConfig):
     frame_token: bool = True
     frame_percept: str = "components"
     memory: int = 256
-    token_share: float = 0.25
+    token_share: float = 0.125
     token_weight: float = 0.1
     frame_weight: float = 1.0
     blind: bool = False
