@@ -15,7 +15,7 @@ from torch import Tensor
 from lerobot_latentsafe.datasets.clips import ClipReader
 from lerobot_latentsafe.decision import FilterDecision, Reason, first_of
 from lerobot_latentsafe.guard import UNSEEN, Guard, Seen, standing_still
-from lerobot_latentsafe.host import all_of, on_host
+from lerobot_latentsafe.host import on_host
 from lerobot_latentsafe.latent import is_sound
 from lerobot_latentsafe.safety_model import SafetyModel
 from lerobot_latentsafe.shield import Judgement, Shield
@@ -73,7 +73,7 @@ class RecordedShield(Shield):
         return Judgement(belief, *self._look_ahead(belief.latent, ahead, hold)), faults
 
     def replay(self, percepts: dict[str, Tensor], state: Tensor, action: Tensor) -> FilterDecision:
-        """Judge the actions (B, A) that were recorded at states (B, S), both in robot units, beside percepts (B, ...)."""
+        """Judge actions (B, A) that were recorded at states (B, S), both in robot units, with percepts (B, ...)."""
         decision = self({**percepts, "observation.state": state}, action)
         self.was_executed(action)
         return decision
@@ -104,9 +104,7 @@ def decision_values(model: SafetyModel, reader: ClipReader, episodes: np.ndarray
     return [found[int(episode)] for episode in episodes]
 
 
-def _along(
-    model: SafetyModel, reader: ClipReader, rows: list[np.ndarray]
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _along(model: SafetyModel, reader: ClipReader, rows: list[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """V and l (B,) at each tick of episodes of these frames, side by side; one that is over stays at its last frame."""
     shield, device, names = RecordedShield(model), model.device, model.world_model.percept_names
     for t in range(max(map(len, rows))):

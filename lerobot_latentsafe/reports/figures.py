@@ -119,6 +119,29 @@ def imagined_futures(
     return figure
 
 
+def misses_and_alarms(rows: list[dict[str, float]], alpha: float, chosen: float | None = None) -> Figure:
+    """Shares of missed failing episodes and of overridden safe ones over epsilon, each below its 95% bound.
+
+    Args:
+        rows: see `calibration.curve`.
+        alpha: share of misses that was asked for.
+        chosen: epsilon.
+    """
+    figure, ax = plt.subplots(figsize=(6, 3.4))
+    epsilon = [row["epsilon"] for row in rows]
+    kinds = (("missed", "failing, missed", "tab:red"), ("false_alarms", "safe, overridden", "tab:blue"))
+    for name, what, colour in kinds:
+        share, bound = ([100 * row[key] for row in rows] for key in (name, f"{name}_at_most"))
+        ax.step(epsilon, share, where="post", color=colour, label=what)
+        ax.fill_between(epsilon, share, bound, step="post", color=colour, alpha=0.15)
+    ax.axhline(100 * alpha, color="tab:red", lw=0.8, ls=":", label=f"alpha = {alpha:.3g}")
+    if chosen is not None:
+        ax.axvline(chosen, color="k", lw=0.8, ls="--", label=f"epsilon = {chosen:.3g}")
+    ax.set(xlabel="epsilon", ylabel="episodes (%); shaded: up to the 95% bound", ylim=(-2, 102))
+    ax.legend(fontsize=8)
+    return figure
+
+
 def write_videos(runs: dict[str, Episodes], folder: str | Path, fps: int = car.FPS) -> list[Path]:
     """One mp4 an episode, bare and shielded side by side, an orange frame while the filter acts."""
     paths = []

@@ -8,13 +8,14 @@ import numpy as np
 import torch
 from lerobot.envs.configs import EnvConfig
 
+from lerobot_latentsafe.calibration import Calibration, in_words
 from lerobot_latentsafe.datasets.episodes import DatasetFrames
 from lerobot_latentsafe.decision import Reason
 from lerobot_latentsafe.evaluation.nearest_frames import NearestFrames
 from lerobot_latentsafe.evaluation.rollouts import Episodes, check_environment, compare, count_reasons
 from lerobot_latentsafe.evaluation.statistics import provenance, wilson
 from lerobot_latentsafe.latent import Latent
-from lerobot_latentsafe.model_card import fallback, rate_in_words, threshold
+from lerobot_latentsafe.model_card import fallback, how_epsilon_was_set, rate_in_words, threshold
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.reports import figures, html
 from lerobot_latentsafe.reports.recorded_episodes import RecordedEpisodes
@@ -93,24 +94,21 @@ def _evaluation(
 
 
 def _about(policy: LatentSafePolicy) -> list[str]:
-    config, trained_on, found = policy.config, policy.config.trained_on, policy.config.calibration
-    evidence = "set by hand"
-    if found:
-        evidence = (
-            f"chosen on {found['failing_episodes']:.0f} failing episodes it had not seen: {found['missed']:.1%} warned "
-            f"too late, {found['false_alarms']:.1%} of safe frames alarmed"
-        )
+    config, trained_on, outdated = policy.config, policy.config.trained_on, policy.outdated()
+    set_how = how_epsilon_was_set(config.calibration, outdated)
     ranges = [f"{name} from {low:.3g} to {high:.3g}" for name, (low, high) in trained_on.ranges.items()]
     rows = [
         ["sees", f"{', '.join(trained_on.cameras)}; {', '.join(trained_on.state_names)}"],
         ["acts on", ", ".join(ranges)],
         ["rate", f"{trained_on.fps} steps a second"],
         ["failure means", f"the recordings' label {config.margin.failure_specification!r}"],
-        ["threshold", f"epsilon = {threshold(config.law)}, {evidence}"],
+        ["threshold", f"epsilon = {threshold(config.law)}, set {set_how}"],
         ["fallback", fallback(config.law)],
         ["mode", "overrides unsafe actions" if config.law.mode == "filter" else "only watches"],
     ]
-    return [html.heading("The filter"), html.table(["", ""], rows)]
+    found = None if outdated else Calibration.read(config.calibration)
+    promise = [] if found is None else [html.heading("How often it misses"), html.paragraph(in_words(found))]
+    return [html.heading("The filter"), html.table(["", ""], rows), *promise]
 
 
 def _comparison(result: dict, folder: Path) -> list[str]:
