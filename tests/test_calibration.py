@@ -489,9 +489,3 @@ def test_the_card_says_how_often_it_misses_and_on_what_evidence(calibrated, tiny
     one = found.groups[ALL]
     assert f"| that fail, 1 frames ahead | {one.n - one.missed} of {one.n} | {one.missed} of {one.n} |" in text
     assert f"n = {one.n}" in text and f"k = {one.k}" in text and "With 95% confidence" in text
-
-
-def test_an_epsilon_set_by_hand_promises_nothing(policy):
-    assert policy.outdated() == []
-    text = policy.generate_model_card("me/car", "latentsafe", None, None).text
-    assert "| epsilon was set | by hand: nothing is promised |" in text

@@ -142,6 +142,25 @@ def misses_and_alarms(rows: list[dict[str, float]], alpha: float, chosen: float 
     return figure
 
 
+def causes_of_misses(studies: dict[str, dict[str, int]]) -> Figure:
+    """A bar for each study: of its missed episodes, the share due to each cause.
+
+    Args:
+        studies: name -> cause -> missed episodes.
+    """
+    figure, ax = plt.subplots(figsize=(6.4, 1.1 + 0.5 * len(studies)))
+    names = [f"{name} (n = {sum(causes.values())})" for name, causes in studies.items()]
+    left = np.zeros(len(studies))
+    for cause in next(iter(studies.values())):
+        share = np.array([100 * causes[cause] / max(1, sum(causes.values())) for causes in studies.values()])
+        ax.barh(names, share, left=left, label=cause.replace("_", " "))
+        left += share
+    ax.set(xlabel="missed failing episodes (%)", xlim=(0, 100))
+    ax.invert_yaxis()
+    ax.legend(fontsize=8, ncols=5, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    return figure
+
+
 def write_videos(runs: dict[str, Episodes], folder: str | Path, fps: int = car.FPS) -> list[Path]:
     """One mp4 an episode, bare and shielded side by side, an orange frame while the filter acts."""
     paths = []

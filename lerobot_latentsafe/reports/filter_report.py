@@ -38,6 +38,7 @@ INTRODUCTION = (
 def write_filter_report(
     path: Path, policy: LatentSafePolicy, env: EnvConfig | None, n_episodes: int, seed: int,
     recorded: DatasetFrames | None = None, extra: Extra | None = None,
+    misses: dict[str, dict[str, int]] | None = None,
 ) -> None:  # fmt: skip
     """Write the report.
 
@@ -46,6 +47,7 @@ def write_filter_report(
         recorded: a dataset; what `latentsafe record` stored is shown, and where the world model cannot draw, its frames
             illustrate what was imagined, beside those of the episodes that are run.
         extra: what to add of the environment.
+        misses: study -> cause -> episodes that were not warned of in time; see `evaluation.misses`.
 
     Raises:
         ValueError: nothing is run, and the dataset was not recorded under a filter.
@@ -60,7 +62,7 @@ def write_filter_report(
     if seen is not None and recorded is not None:
         seen.add_dataset(recorded)
     with TemporaryDirectory() as folder:
-        parts = [html.paragraph(INTRODUCTION), *_about(policy)]
+        parts = [html.paragraph(INTRODUCTION), *_about(policy), *_misses(misses or {}, Path(folder))]
         if env is not None:
             parts += _evaluation(policy, env, n_episodes, seed, Path(folder), seen, extra)
         if recorded is not None and RecordedEpisodes.is_one(recorded):
@@ -109,6 +111,18 @@ def _about(policy: LatentSafePolicy) -> list[str]:
     found = None if outdated else Calibration.read(config.calibration)
     promise = [] if found is None else [html.heading("How often it misses"), html.paragraph(in_words(found))]
     return [html.heading("The filter"), html.table(["", ""], rows), *promise]
+
+
+def _misses(misses: dict[str, dict[str, int]], folder: Path) -> list[str]:
+    """Which part of the filter is to blame for what was missed: a bar for each study."""
+    if not misses:
+        return []
+    figures.save(figures.causes_of_misses(misses), folder / "misses.png")
+    caption = (
+        "Recorded failures that were not warned of in time. Doomed: they failed at once. Fallback: V fell to epsilon, "
+        "but late. Margin: blind to the failure. World model: imagined otherwise than it came. Value: it saw a way out."
+    )
+    return [html.heading("Where misses come from"), html.picture(folder / "misses.png", caption)]
 
 
 def _comparison(result: dict, folder: Path) -> list[str]:

@@ -115,8 +115,8 @@ def judged(model: SafetyModel, episodes: Sequence[Episode]) -> list[EpisodeDecis
 def against_the_truth(rows: list[EpisodeDecisions], episodes: Sequence[Episode], epsilon: float) -> dict:
     """Misses of an epsilon by state and by episode, where nothing but the exact value says what was dangerous.
 
-    A state is dangerous if no steering keeps the car safe after the action that was taken there. An episode is missed if
-    nothing was said until the last state from which the car could still be kept safe.
+    A state is dangerous if no steering keeps the car safe after the action that was taken there. An episode is missed
+    if nothing was said until the last state from which the car could still be kept safe.
     """
     missed = dangerous = alarms = harmless = late = doomed = 0
     for row, episode in zip(rows, episodes):
@@ -136,7 +136,7 @@ def against_the_truth(rows: list[EpisodeDecisions], episodes: Sequence[Episode],
 
 
 def study_car(path: str = "dubins", n_episodes: int = CAR_EPISODES) -> tuple[dict, Resampled]:
-    """The committed filter of the car on random driving of new seeds, and of another policy's on what it then misses."""
+    """The committed filter of the car on random driving of new seeds; and what it then misses of another policy's."""
     model = load_filter(path).model
     random = list(random_episodes(n_episodes, np.random.default_rng(SEED), car.TURN_RATES))
     rows = judged(model, random)
