@@ -28,8 +28,10 @@ from lerobot_latentsafe.datasets.build_cache import build_frame_cache
 from lerobot_latentsafe.datasets.episode_groups import groups_of, weights_of
 from lerobot_latentsafe.datasets.fingerprints import SHORT, TrainedOnError, episode_marks, with_episodes
 from lerobot_latentsafe.decision import LawOptions
+from lerobot_latentsafe.evaluation.decision_values import decision_values
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
 from lerobot_latentsafe.safety_model import UntrainedFilterError
+from lerobot_latentsafe.training import load_with_cache
 from lerobot_latentsafe.units import TrainedOn
 
 HELD = 16
@@ -77,6 +79,19 @@ def command(filter, held_root, out, **options):
     """A calibration that there is evidence enough for."""
     given = dict(dataset=DatasetSource("me/held", str(held_root)), alpha=0.3, lead_steps=1)
     return Calibrate(PolicySource(str(filter)), out, **{**given, **options})
+
+
+@pytest.fixture(scope="module")
+def judgements(tiny_filter, held_root):
+    """What the tiny filter would have decided by along them."""
+    policy, reader = load_with_cache(tiny_filter, tiny.metadata(held_root, "me/held"))
+    return decision_values(policy.model, reader, np.arange(HELD))
+
+
+@pytest.fixture
+def judged_already(judgements, monkeypatch):
+    """The same, wherever a command asks again."""
+    monkeypatch.setattr(train, "decision_values", lambda model, reader, episodes: [judgements[e] for e in episodes])
 
 
 @pytest.fixture(scope="module")
@@ -321,9 +336,10 @@ def test_episodes_that_were_trained_on_are_refused(tiny_filter, cache_root, tmp_
 # -- the command ---
 
 
-def test_command_writes_a_filter_with_epsilon_and_evidence(calibrated):
+def test_command_writes_a_filter_with_epsilon_and_evidence(calibrated, judgements):
     config = LatentSafePolicy.from_pretrained(calibrated).config
     found = Calibration.read(config.calibration)
+    assert found.epsilon == calibrate(Scores.of(judgements, 1), 0.3, 1, fps=20).epsilon
     assert found.epsilon == config.law.epsilon and config.trained_on.stage == "critic"
     assert found.lead_s == 1 / 20 and found.trained_on_known and found.alpha == 0.3
     assert config.frame_cache is None  # a folder of this machine has no business in a checkpoint
@@ -337,7 +353,7 @@ def test_the_scores_of_all_episodes_and_the_curve_are_written(calibrated):
     assert written["curve"] and (calibrated.parent / "curve.png").stat().st_size > 1000
 
 
-def test_a_calibration_that_breaks_off_leaves_no_filter(tiny_filter, held_root, tmp_path, monkeypatch):
+def test_a_calibration_that_breaks_off_leaves_no_filter(tiny_filter, held_root, tmp_path, monkeypatch, judged_already):
     def killed(*given):
         raise KeyboardInterrupt
 
@@ -347,7 +363,7 @@ def test_a_calibration_that_breaks_off_leaves_no_filter(tiny_filter, held_root, 
     assert not any(tmp_path.iterdir())
 
 
-def test_the_curve_is_written_before_anything_is_refused(tiny_filter, held_root, tmp_path):
+def test_the_curve_is_written_before_anything_is_refused(tiny_filter, held_root, tmp_path, judged_already):
     file = tmp_path / "curve.json"
     with pytest.raises(ValueError, match=r"--alpha=0\.01 takes 99 failing"):
         command(tiny_filter, held_root, tmp_path / "out", alpha=0.01, json=file).run()
@@ -360,7 +376,9 @@ def test_the_option_of_earlier_versions_is_understood(tmp_path):
         main(["calibrate", "--policy.path=no/such", f"--output_dir={tmp_path / 'out'}", "--max_missed=3"])
 
 
-def test_in_closed_loop_epsilon_is_the_least_cautious_that_is_proven(tiny_filter, tiny_diffusion, held_root, tmp_path):
+def test_in_closed_loop_epsilon_is_the_least_cautious_that_is_proven(
+    tiny_filter, tiny_diffusion, held_root, tmp_path, judged_already
+):
     options = dict(
         closed_loop=True, env=LatentSafeDubinsEnv(episode_length=4), base_policy_path=str(tiny_diffusion), alpha=0.45,
         epsilons=[0.9, 0.2, 0.1], n_runs=6,
@@ -381,7 +399,7 @@ def test_in_closed_loop_epsilon_is_the_least_cautious_that_is_proven(tiny_filter
         ({"max_false_alarms": 0.001}, "cannot both be kept"),
     ],
 )
-def test_what_cannot_be_calibrated_is_refused(options, message, tiny_filter, held_root, tmp_path):
+def test_what_cannot_be_calibrated_is_refused(options, message, tiny_filter, held_root, tmp_path, judged_already):
     with pytest.raises(ValueError, match=message):
         replace(command(tiny_filter, held_root, tmp_path / "out"), **options).run()
     assert not (tmp_path / "out").exists()

@@ -72,6 +72,9 @@ class RecordedShield(Shield):
         faults = np.where(on_host(unsound, torch.bool) & (faults == Reason.PASSED), Reason.FILTER_FAILED, faults)
         return Judgement(belief, *self._look_ahead(belief.latent, ahead, hold)), faults
 
+    def _tell(self, decision: FilterDecision) -> None:
+        """Nothing: it acts on nobody."""
+
     def replay(self, percepts: dict[str, Tensor], state: Tensor, action: Tensor) -> FilterDecision:
         """Judge actions (B, A) that were recorded at states (B, S), both in robot units, with percepts (B, ...)."""
         decision = self({**percepts, "observation.state": state}, action)

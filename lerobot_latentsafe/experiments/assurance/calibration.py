@@ -32,7 +32,7 @@ from lerobot_latentsafe.safety_model import SafetyModel
 from lerobot_latentsafe.training import load_with_cache
 
 ALPHA, LEAD_STEPS, RESAMPLINGS, SEED = 0.05, 3, 1000, 2000
-CAR_EPISODES = 1200
+CAR_EPISODES = 600
 
 
 @dataclass(frozen=True)
