@@ -29,7 +29,9 @@ from lerobot_latentsafe.datasets.episode_groups import groups_of, weights_of
 from lerobot_latentsafe.datasets.fingerprints import SHORT, TrainedOnError, episode_marks, with_episodes
 from lerobot_latentsafe.decision import LawOptions
 from lerobot_latentsafe.evaluation.decision_values import decision_values
+from lerobot_latentsafe.evaluation.misses import CAUSES
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
+from lerobot_latentsafe.reports.filter_report import write_filter_report
 from lerobot_latentsafe.safety_model import UntrainedFilterError
 from lerobot_latentsafe.training import load_with_cache
 from lerobot_latentsafe.units import TrainedOn
@@ -507,3 +509,17 @@ def test_the_card_says_how_often_it_misses_and_on_what_evidence(calibrated, tiny
     one = found.groups[ALL]
     assert f"| that fail, 1 frames ahead | {one.n - one.missed} of {one.n} | {one.missed} of {one.n} |" in text
     assert f"n = {one.n}" in text and f"k = {one.k}" in text and "With 95% confidence" in text
+
+
+def test_the_report_says_it_too_and_draws_where_misses_come_from(calibrated, tmp_path):
+    policy, page = load_filter(calibrated), tmp_path / "report.html"
+    bars = {"held out": dict.fromkeys(CAUSES, 1)}
+    write_filter_report(page, policy, None, 1, 0, misses=bars)
+    text = page.read_text()
+    assert "How often it misses" in text and "held-out episodes that never fail" in text
+    assert "Where misses come from" in text and "imagined otherwise than it came" in text
+    policy.config.change(law=policy.config.law.changed(LawOptions(proposal_steps=6)))
+    write_filter_report(page, policy, None, 1, 0)
+    text = page.read_text()
+    assert "How often it misses" not in text and "Where misses come from" not in text
+    assert "nothing is promised of this filter: calibrated for another law: proposal_steps is 6, was 1" in text
