@@ -50,7 +50,7 @@ class LatentSafeConfig(PreTrainedConfig):
         base_policy_path: the policy to shield: a folder, a Hub id or the name of a committed checkpoint.
         base_ahead: if not 0, the base policy's next chunk of actions is made off the control thread, begun when so many
             of the present one are still to come. For a base policy that takes longer than a period to think.
-        calibration: the evidence epsilon was chosen on; written by `latentsafe calibrate`.
+        calibration: the evidence epsilon was chosen on, see `Calibration`; written by `latentsafe calibrate`.
         evaluation: what was measured -> the rate in words; written by `latentsafe push --results=...` for the card.
         optimizer_lr, grad_clip_norm, scheduler_steps: of the training of world model and margin by lerobot-train.
         drop_n_last_frames: frames at the end of each episode at which no training window starts.
@@ -67,7 +67,7 @@ class LatentSafeConfig(PreTrainedConfig):
     frame_cache: str | None = None
     base_policy_path: str | None = None
     base_ahead: int = 0
-    calibration: dict[str, float] = field(default_factory=dict)
+    calibration: dict[str, Any] = field(default_factory=dict)
     evaluation: dict[str, str] = field(default_factory=dict)
 
     optimizer_lr: float = 1e-3

@@ -7,13 +7,14 @@ import html
 import json
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from huggingface_hub import ModelCard, ModelCardData
 from huggingface_hub.utils import HFValidationError, validate_repo_id
 
+from lerobot_latentsafe.calibration import ALL, Calibration, in_words
 from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
 from lerobot_latentsafe.decision import LAWS, RECENT, LawConfig
 from lerobot_latentsafe.meanings import Command
@@ -37,7 +38,7 @@ lerobot-teleoperate --robot.type=latentsafe_shielded --robot.filter={repo_id} --
 First run it with `--policy.law.mode=monitor` or `--robot.law.mode=monitor`, which never acts and reports what it would
 have done.
 
-{confusion}{evaluation}## Limits
+{calibrated}{evaluation}## Limits
 
 {limits}
 - A policy under it cannot tell that a frame is late or frozen; a robot under it (`latentsafe_shielded`) can.
@@ -138,12 +139,14 @@ def _header(dataset_repo_id: str, license: str | None, tags: list[str] | None, n
     ).to_yaml()
 
 
-CONFUSION = """## As a monitor, on held-out episodes
+CALIBRATED = """## How often it misses
 
-| | warned | quiet |
+{said}
+
+| held-out episodes | warned | quiet |
 |---|---|---|
-| failing episodes, {lead_steps:.0f} frames ahead | {warned} of {failing} | {missed} of {failing} |
-| frames of episodes that never fail | {alarms} of {safe} | {quiet} of {safe} |
+| that fail, {lead_steps} frames ahead | {warned} of {failing} | {missed} of {failing} |
+| that never fail | {alarms} of {safe} | {quiet} of {safe} |
 
 """
 
@@ -151,15 +154,20 @@ RATES = ("spilled", "spills_below_5_percent", "violation", "incompletion", "succ
 
 
 def make_model_card(
-    config: LatentSafeConfig, dataset_repo_id: str, license: str | None, tags: list[str] | None
-) -> ModelCard:
-    """The card of a filter, from its configuration alone."""
+    config: LatentSafeConfig, dataset_repo_id: str, license: str | None, tags: list[str] | None,
+    outdated: Sequence[str] = (),
+) -> ModelCard:  # fmt: skip
+    """The card of a filter, from its configuration.
+
+    Args:
+        outdated: why its calibration is another filter's, if it is; see `calibration.differences`.
+    """
     guards = config.law.name == "guard"
     limits = GUARD_LIMITS if guards else FILTER_LIMITS.format(imagination=_imagination(config.law.samples))
     rows = {
         "trained on": _code(dataset_repo_id),
         **_robot(config),
-        **({"law": "guard: checks alone, there is no V"} if guards else _judgement(config)),
+        **({"law": "guard: checks alone, there is no V"} if guards else _judgement(config, outdated)),
         "shields": _code(config.base_policy_path) if config.base_policy_path else "nothing yet",
     }
     return ModelCard(
@@ -168,7 +176,7 @@ def make_model_card(
             introduction=GUARD if guards else FILTER,
             rows="".join(f"| {what} | {said} |\n" for what, said in rows.items()),
             repo_id=_repository(config.repo_id, "me/filter"),
-            confusion="" if guards else _confusion(config.calibration),
+            calibrated="" if guards or outdated else _calibrated(config.calibration),
             evaluation=_evaluation(config.evaluation),
             limits=limits,
         )
@@ -187,7 +195,7 @@ def _robot(config: LatentSafeConfig) -> dict[str, str]:
     }
 
 
-def _judgement(config: LatentSafeConfig) -> dict[str, str]:
+def _judgement(config: LatentSafeConfig, outdated: Sequence[str]) -> dict[str, str]:
     """What V is, and what comes of it, in words."""
     law = config.law
     return {
@@ -196,7 +204,7 @@ def _judgement(config: LatentSafeConfig) -> dict[str, str]:
         "stage": config.trained_on.stage,
         "law": f"{law.name}, V read {_ahead(config)}",
         "epsilon": threshold(law),
-        "epsilon was set": _calibration(config.calibration),
+        "epsilon was set": _said(how_epsilon_was_set(config.calibration, outdated)),
         "fallback": _said(fallback(law)),
     }
 
@@ -251,34 +259,33 @@ def _imagination(samples: int) -> str:
     return f"Imagination draws {samples} futures and believes the worst: what it did not draw is not foreseen."
 
 
-EVIDENCE = ("failing_episodes", "safe_frames", "missed", "lead_steps", "false_alarms")
+def how_epsilon_was_set(evidence: dict[str, Any], outdated: Sequence[str]) -> str:
+    """On what evidence, in one line; evidence that is another filter's promises nothing of this one.
 
-
-def _is_whole(evidence: dict[str, float]) -> bool:
-    """Whether `latentsafe calibrate` could have written this: counts, and shares of them."""
-    numbers = [evidence.get(name) for name in EVIDENCE]
-    counted = all(isinstance(n, int | float) and math.isfinite(n) and n >= 0 for n in numbers)
-    return counted and max(evidence["missed"], evidence["false_alarms"]) <= 1
-
-
-def _calibration(evidence: dict[str, float]) -> str:
+    Args:
+        outdated: see `make_model_card`.
+    """
     if not evidence:
-        return "by hand"
-    if not _is_whole(evidence):
+        return "by hand: nothing is promised"
+    if outdated:
+        return f"nothing is promised of this filter: {'; '.join(outdated)}. Run latentsafe calibrate again"
+    found = Calibration.read(evidence)
+    if found is None:
         return "by latentsafe calibrate, whose evidence is not whole"
-    return (
-        f"on {evidence['failing_episodes']:.0f} held-out failing episodes: {evidence['missed']:.1%} warned later than "
-        f"{evidence['lead_steps']:.0f} frames ahead, {evidence['false_alarms']:.1%} false alarms"
-    )
+    everyone = found.groups[ALL]
+    return f"by latentsafe calibrate, on {everyone.n} failing and {found.safe_episodes} safe episodes held out"
 
 
-def _confusion(evidence: dict[str, float]) -> str:
-    if not evidence or not _is_whole(evidence):
+def _calibrated(evidence: dict[str, Any]) -> str:
+    found = Calibration.read(evidence)
+    if found is None:
         return ""
-    failing, safe = round(evidence["failing_episodes"]), round(evidence["safe_frames"])
-    missed, alarms = round(evidence["missed"] * failing), round(evidence["false_alarms"] * safe)
+    failing, missed = found.groups[ALL].n, found.groups[ALL].missed
+    safe, alarms = found.safe_episodes, found.false_alarms
     counts = {"warned": failing - missed, "missed": missed, "alarms": alarms, "quiet": safe - alarms}
-    return CONFUSION.format(lead_steps=evidence["lead_steps"], failing=failing, safe=safe, **counts)
+    return CALIBRATED.format(
+        said=_said(in_words(found)), lead_steps=found.lead_steps, failing=failing, safe=safe, **counts
+    )
 
 
 def _evaluation(rates: dict[str, str]) -> str:

@@ -5,6 +5,7 @@ them. `select_action` is the fallback policy; given a base policy, it is the bas
 """
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,13 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
-from lerobot_latentsafe._compat import EVALUATION, NOT_AVERAGED, ROLLOUT, called_from
+from lerobot_latentsafe._compat import EVALUATION, NOT_AVERAGED, ROLLOUT, called_from, training_run
 from lerobot_latentsafe.base_policy import BasePolicy, base_to_shield
+from lerobot_latentsafe.calibration import Calibration, belonging, differences
 from lerobot_latentsafe.configuration_latentsafe import SEALED, SEALED_ENTRIES, LatentSafeConfig
 from lerobot_latentsafe.datasets.adoption import adopt_dataset, check_candidates
 from lerobot_latentsafe.datasets.clips import FilterData
+from lerobot_latentsafe.datasets.fingerprints import episode_marks, with_episodes
 from lerobot_latentsafe.datasets.live_cameras import looks_of
 from lerobot_latentsafe.decision import FilterDecision, LawOptions, Reason
 from lerobot_latentsafe.guard import standing_still
@@ -36,6 +39,7 @@ from lerobot_latentsafe.runtime.checkpoint import (
     read_config,
     resolve_checkpoint,
     seal,
+    weights_digest,
     writing_checkpoint,
 )
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
@@ -78,7 +82,7 @@ class LatentSafePolicy(PreTrainedPolicy):
         if data is not None and data.cache is not None:
             self.model.world_model.load_basis(Path(data.frame_cache))
         setattr(self, NOT_AVERAGED, self._never_averaged())
-        self._told_untrained = False
+        self._told_untrained = self._told_outdated = False
         self._base: list[BasePolicy] = []  # in a list, so that its weights are not ours
         self._base_lost = False
         self._in_time = TimeLimit(self.model.device.type)
@@ -153,6 +157,7 @@ class LatentSafePolicy(PreTrainedPolicy):
         if called_from(EVALUATION):  # a simulation waits for every action
             self.shield.clock = standing_still
         self.shield.pace.strict |= called_from(ROLLOUT)
+        self.say_if_outdated()
         self.shield.reset()
         self.shield.warm_up()
         if self.base:
@@ -257,6 +262,30 @@ class LatentSafePolicy(PreTrainedPolicy):
         )
         return False
 
+    # -- what its calibration belongs to ---
+
+    def belonging(self) -> dict[str, Any]:
+        """What a calibration of this filter is of: its law, its weights, and the policy that it shields."""
+        base = weights_digest(self.base.policy.state_dict()) if self.base else None
+        return belonging(self.config.law, weights_digest(self.model.state_dict()), base, self.config.base_policy_path)
+
+    def take_calibration(self, found: Calibration, epsilon: float) -> None:
+        """Set the threshold, and keep the evidence beside it, with what it belongs to."""
+        self.config.change(law=replace(self.config.law, epsilon=epsilon))
+        self.config.change(calibration=replace(found, belongs_to=self.belonging()).as_json())
+
+    def outdated(self) -> list[str]:
+        """In words, why the evidence for epsilon does not speak of this filter as it is; empty where it does."""
+        return differences(self.config.calibration, self.belonging()) if self.config.calibration else []
+
+    def say_if_outdated(self) -> None:
+        """Warn once of a calibration that is another filter's."""
+        if self._told_outdated:
+            return
+        self._told_outdated = True
+        for why in self.outdated():
+            logger.warning("epsilon is not calibrated for this filter: %s. Run latentsafe calibrate again", why)
+
     # -- files ---
 
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
@@ -304,7 +333,7 @@ class LatentSafePolicy(PreTrainedPolicy):
     def generate_model_card(self, dataset_repo_id: str, model_type: str, license: str | None,
                             tags: list[str] | None, cfg=None, dataset_meta=None) -> ModelCard:  # fmt: skip
         """A card that says what the filter was trained on, how epsilon was set, and what it is not."""
-        return make_model_card(self.config, dataset_repo_id, license, tags)
+        return make_model_card(self.config, dataset_repo_id, license, tags, self.outdated())
 
 
 def _check(folder: Path, config: PreTrainedConfig, training: bool) -> None:
@@ -353,6 +382,7 @@ def load_filter(
         policy.config.change(law=policy.config.law.changed(law))
     if base_policy is not None:
         policy.attach(base_policy)
+    policy.say_if_outdated()
     policy.shield.warm_up()
     return policy
 
@@ -373,6 +403,9 @@ def adopt(config: LatentSafeConfig, meta: LeRobotDatasetMetadata) -> FilterData:
     if config.trained_on.action_low is not None:  # else LeRobot has just read the shapes from the same dataset
         data.check_cameras({key: config.input_features[key].shape for key in data.cameras})
     trained_on = adopt_dataset(config.trained_on, data.contract)
+    run, contract = training_run(), data.contract
+    marks = episode_marks(contract.episode, contract.state, contract.action)
+    trained_on = with_episodes(trained_on, marks, run.dataset.episodes if run is not None else None)
     trained_on.cameras = list(data.cameras)
     if trained_on.looks is None:
         trained_on.looks = looks_of(meta, data.contract, trained_on, data.cache)

@@ -17,17 +17,19 @@ from tqdm import trange
 from lerobot_latentsafe.critic import BACKUPS
 from lerobot_latentsafe.datasets.adoption import adopt_dataset
 from lerobot_latentsafe.datasets.clips import ClipReader, FilterData
+from lerobot_latentsafe.datasets.fingerprints import episode_marks, with_episodes
 from lerobot_latentsafe.latent import Latent, map_latent, select
 from lerobot_latentsafe.margin import FailureMargin, hinge_loss
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
 from lerobot_latentsafe.reachability import LatentReachability, Starts
-from lerobot_latentsafe.runtime.checkpoint import CONFIG, CheckpointError, read_config
+from lerobot_latentsafe.runtime.checkpoint import CONFIG, CheckpointError, read_config, weights_digest
 from lerobot_latentsafe.runtime.distributed import gathered, rank, share
 from lerobot_latentsafe.runtime.files import claim, differing, refuse_existing, replacing_folder
 from lerobot_latentsafe.runtime.hub import save_policy
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
 from lerobot_latentsafe.runtime.options import require_at_least
 from lerobot_latentsafe.safety_model import SafetyModel
+from lerobot_latentsafe.units import TrainedOn
 
 logger = logging.getLogger(__name__)
 
@@ -126,7 +128,7 @@ def train_margin(path: str | Path, dataset_meta, output_dir: Path, seed: int = 0
         features, failure = seen_and_imagined(model, reader, config.margin.clips, generator)
         model.margin = model.new_margin()
         fit_margin(model.margin, features, failure, config.margin.delta, generator, noise=config.margin.noise)
-        config.change(trained_on=replace(config.trained_on, stage="world_model"), frame_cache=None)
+        config.change(trained_on=replace(trained_on_too(policy, reader), stage="world_model"), frame_cache=None)
         _save(policy, model.margin, folder, run)
     print(f"margin: {time.process_time() - started:.0f} CPU-s")
     return policy
@@ -157,6 +159,11 @@ def cached_reader(policy: LatentSafePolicy, dataset_meta) -> ClipReader:
     reader.require_cache()
     config.world_model.of_cache(data.cache.manifest)
     return reader
+
+
+def trained_on_too(policy: LatentSafePolicy, reader: ClipReader) -> TrainedOn:
+    """What a filter was trained on, with the episodes of this dataset among it."""
+    return with_episodes(policy.config.trained_on, episode_marks(reader.labels.episode, reader.state, reader.action))
 
 
 @torch.no_grad()
@@ -268,7 +275,7 @@ def _learn_critic(policy: LatentSafePolicy, reader: ClipReader, seed: int, steps
         metrics = learner.update()
         if step % 200 == 0:
             progress.set_postfix(loss=f"{metrics['critic_loss']:.1e}", gamma=f"{metrics['gamma']:.4f}")
-    policy.config.change(trained_on=replace(policy.config.trained_on, stage="critic"))
+    policy.config.change(trained_on=replace(trained_on_too(policy, reader), stage="critic"))
     model.critic.eval()
 
 
@@ -292,13 +299,11 @@ def _aim_at(model: SafetyModel, reader: ClipReader, target: str, steps: int | No
 
 def _run(policy: LatentSafePolicy, reader: ClipReader, stage: str, **options: object) -> dict:
     """All that a training depends on, JSON-able."""
-    config, known = policy.config, hashlib.sha256()
-    for tensor in policy.state_dict().values():
-        known.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
+    config = policy.config
     groups = {name: asdict(getattr(config, name)) for name in ("margin", "reachability", "fallback")}
     return {
         "stage": stage,
-        "weights": known.hexdigest(),
+        "weights": weights_digest(policy.state_dict()),
         "dataset": reader.cache.manifest["fingerprint"],
         "labels": hashlib.sha256(reader.labels.failure.astype(np.int8)).hexdigest(),
         **json.loads(json.dumps(groups, default=str)),

@@ -45,6 +45,7 @@ class TrainedOn:
         state_step: by how much each number of the state changes from frame to frame at most.
         unanswered: how far each command goes at most while the state stays as it is; see `looks.Response`.
         looks: camera key -> what its pictures have in common.
+        episodes: fingerprints of the episodes trained on, 8 hex digits each; None: unknown. See `episode_marks`.
     """
 
     stage: str = "untrained"
@@ -71,6 +72,7 @@ class TrainedOn:
     state_std: list[float] | None = None
     unanswered: list[float] | None = None
     looks: dict[str, Look] | None = None
+    episodes: str | None = None
 
     def __post_init__(self) -> None:
         if self.stage not in STAGES:

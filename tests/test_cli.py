@@ -442,7 +442,8 @@ def test_held_out_episodes_may_be_named(tiny_filter, cache_root, tmp_path, monke
         asked.append(episodes.tolist())
         raise ValueError("enough")
 
-    monkeypatch.setattr("lerobot_latentsafe.cli.train.episode_values", note)
+    monkeypatch.setattr("lerobot_latentsafe.cli.train.decision_values", note)
+    monkeypatch.setattr("lerobot_latentsafe.cli.train.refuse_trained_on", lambda *_: True)
     monkeypatch.setattr("lerobot_latentsafe.cli.evaluate.evaluate_world_model", note)
     options = [f"--policy.path={tiny_filter}", f"--dataset.root={cache_root}", f"--dataset.repo_id={tiny.REPO_ID}"]
     options += [f"--output_dir={tmp_path / 'out'}"] if verb == "calibrate" else []

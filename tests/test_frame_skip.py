@@ -6,10 +6,10 @@ import tiny
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_latentsafe.calibration import episode_values
 from lerobot_latentsafe.datasets.episodes import DatasetFrames
 from lerobot_latentsafe.decision import LawOptions
 from lerobot_latentsafe.evaluation.along_episodes import encode_episodes, values_along
+from lerobot_latentsafe.evaluation.decision_values import decision_values
 from lerobot_latentsafe.guard import standing_still
 from lerobot_latentsafe.modeling_latentsafe import load_filter
 from lerobot_latentsafe.shield import Shield
@@ -47,12 +47,12 @@ def test_the_filter_remembers_what_episodes_are_judged_by(skipping, dataset_root
     assert encoded["action"].shape[-1] == SKIP * tiny.ACTION_DIM and length > 2 * SKIP
 
 
-def test_values_of_cached_and_of_decoded_episodes_agree(skipping, cache_meta, dataset_meta):
+def test_margins_of_cached_and_of_decoded_episodes_agree(skipping, cache_meta, dataset_meta):
     policy, reader = load_with_cache(skipping, cache_meta)
-    (row,) = episode_values(policy.model, reader, np.array([EPISODE]))
+    (row,) = decision_values(policy.model, reader, np.array([EPISODE]))
     found = values_along(policy.model, DatasetFrames(dataset_meta, [EPISODE]), EPISODE)
-    assert len(row["value"]) == dataset_meta.episodes[EPISODE]["length"]
-    np.testing.assert_allclose(row["value"], found.value, atol=1e-4)
+    assert len(row.margin) == dataset_meta.episodes[EPISODE]["length"]
+    np.testing.assert_allclose(row.margin, found.margin, atol=1e-4)
 
 
 @pytest.mark.parametrize(("ticks", "steps"), [(1, 1), (3, 1), (4, 2), (15, 5)])

@@ -88,6 +88,12 @@ VERBS: dict[str, Verb] = {
     "eval-world-model": Verb(
         "evaluate", _EVALUATE, "EvalWorldModel", "ask a world model whether it obeys the action and looks"
     ),
+    "explain-misses": Verb(
+        "evaluate",
+        _EVALUATE,
+        "ExplainMisses",
+        "tell which part of a filter is to blame for failures it did not warn of",
+    ),
     "report": Verb("evaluate", _EVALUATE, "Report", "write one HTML file about a filter and what it changes"),
     "draw-features": Verb("evaluate", _EVALUATE, "DrawFeatures", "draw what an encoder makes of the bag's variants"),
 }

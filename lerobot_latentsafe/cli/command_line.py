@@ -30,6 +30,7 @@ LAW = {old: f"law.{new}" for old, (group, new) in MOVED.items() if group == "law
 ROBOT = {f"robot.{old}": f"robot.{LAW[old]}" for old in ("mode", "epsilon", "release", "guard")}
 
 RENAMED: dict[str, dict[str, str]] = {
+    "calibrate": {"max_missed": "alpha"},
     "collect": {"repo_id": "dataset.repo_id", "root": "dataset.root", "n_episodes": "dataset.num_episodes"},
     "record": ROBOT,
     "teleoperate": ROBOT,

@@ -12,10 +12,12 @@ from lerobot_latentsafe.cli.options import (
     DefaultPolicySource,
     OptionalDatasetSource,
     OptionalPolicySource,
+    PolicySource,
 )
 from lerobot_latentsafe.decision import LawOptions
 from lerobot_latentsafe.dubins.ground_truth import load_states, truth_on
 from lerobot_latentsafe.encoders.patch_encoders import load_encoder
+from lerobot_latentsafe.evaluation.misses import explain_misses, read_causes
 from lerobot_latentsafe.evaluation.rollouts import check_environment, compare
 from lerobot_latentsafe.evaluation.statistics import provenance, write_json
 from lerobot_latentsafe.evaluation.world_model import evaluate_world_model
@@ -25,7 +27,7 @@ from lerobot_latentsafe.experiments.dubins.figures import trajectories, value_sl
 from lerobot_latentsafe.experiments.dubins.monitor import LatentMonitor, evaluate_monitor
 from lerobot_latentsafe.experiments.dubins.report import car_parts
 from lerobot_latentsafe.modeling_latentsafe import load_filter
-from lerobot_latentsafe.reports.figures import save, write_videos
+from lerobot_latentsafe.reports.figures import causes_of_misses, save, write_videos
 from lerobot_latentsafe.reports.filter_report import write_filter_report
 from lerobot_latentsafe.runtime.files import replacing
 from lerobot_latentsafe.runtime.options import require_at_least
@@ -236,6 +238,51 @@ def _short(number: float | dict | None) -> str:
 
 
 @dataclass
+class ExplainMisses:
+    """Tell which part of a filter is to blame for recorded failures that it did not warn of in time.
+
+    latentsafe explain-misses --policy.path=outputs/calibrated --dataset.repo_id=me/held_cache \\
+      --dataset.root=data/held_tokens --json=outputs/misses.json
+
+    The first that holds: doomed (it failed before the lead had passed), fallback (V fell to epsilon, but later than the
+    lead), margin (it does not see the failure that is there), world_model (it imagined otherwise than it came), value
+    (imagination foresees the failure, and V said that there was a way out). Options of --law change the filter's law.
+    """
+
+    policy: PolicySource
+    dataset: DatasetSource = field(default_factory=DatasetSource)
+    n_episodes: int = 200
+    """Episodes used at most, the last ones of the dataset, if --dataset.episodes names none."""
+    lead_steps: int = 3
+    """Frames of warning asked for before the failure."""
+    law: LawOptions = field(default_factory=LawOptions)
+    json: Path | None = None
+    """Where to write the episodes of each cause; latentsafe report --misses=[...] draws them."""
+    figure: Path | None = None
+    """Where to draw their shares, .png."""
+
+    def __post_init__(self) -> None:
+        require_at_least("--n_episodes", self.n_episodes, 1)
+        require_at_least("--lead_steps", self.lead_steps, 1)
+
+    def run(self) -> None:
+        """Judge, print and write."""
+        policy, reader = load_with_cache(self.policy.path, self.dataset.metadata())
+        policy.config.change(law=policy.config.law.changed(self.law))
+        episodes = self.dataset.of(reader.labels.episode, self.n_episodes)
+        found = explain_misses(policy.model, reader, episodes, self.lead_steps)
+        counts = {cause: len(some) for cause, some in found.missed.items()}
+        print(f"{len(found.warned)} of {len(found.warned) + sum(counts.values())} failing episodes warned of in time")
+        for cause, n in counts.items():
+            print(f"{cause:12s} {n}")
+        if self.json:
+            row = {"warned": found.warned, "missed": found.missed, "shares": found.shares()}
+            write_json(self.json, {**row, "epsilon": policy.config.law.epsilon, **provenance(seeds=[])})
+        if self.figure:
+            save(causes_of_misses({policy.config.law.name: counts}), self.figure)
+
+
+@dataclass
 class Report:
     """Write one HTML file about a filter, which opens from disk and prints.
 
@@ -261,6 +308,8 @@ class Report:
     """Episodes of each, bare and shielded."""
     seed: int = 0
     """Of the first start; the next ones follow."""
+    misses: list[Path] = field(default_factory=list)
+    """Files of explain-misses, each of which gets a bar."""
 
     def __post_init__(self) -> None:
         _require_episodes(self.n_episodes, self.seed)
@@ -272,7 +321,8 @@ class Report:
         policy = load_filter(self.policy.path, law=self.law, base_policy=self.base_policy_path)
         recorded = self.dataset.frames() if self.dataset.repo_id or self.dataset.root else None
         extra = car_parts if self.env is not None and self.env.type == CAR else None
-        write_filter_report(self.output, policy, self.env, self.n_episodes, self.seed, recorded, extra)
+        misses = {file.stem: read_causes(file) for file in self.misses}
+        write_filter_report(self.output, policy, self.env, self.n_episodes, self.seed, recorded, extra, misses)
         print(f"open {self.output}")
 
 

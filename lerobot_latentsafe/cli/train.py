@@ -1,14 +1,34 @@
 """Verbs that make a filter: cached frames, the margin, the critic, the threshold."""
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
-from lerobot_latentsafe.calibration import calibrate, check_options, episode_values, store
+from lerobot.envs.configs import EnvConfig
+
+from lerobot_latentsafe.calibration import (
+    Calibration,
+    Scores,
+    calibrate,
+    check_options,
+    curve,
+    in_words,
+    require_few_alarms,
+)
 from lerobot_latentsafe.cli.options import CACHE_THEM, DatasetSource, PolicySource
+from lerobot_latentsafe.conformal import fixed_sequence, needed_for_sure, proven
 from lerobot_latentsafe.datasets.build_cache import TOKEN_COMPONENTS, TOKEN_TYPES, Pictures, Tokens, build_frame_cache
+from lerobot_latentsafe.datasets.clips import ClipReader
+from lerobot_latentsafe.datasets.episode_groups import groups_of, weights_of
+from lerobot_latentsafe.datasets.fingerprints import episode_marks, refuse_trained_on
 from lerobot_latentsafe.datasets.frame_cache import FrameCache
 from lerobot_latentsafe.encoders.perception import PerceptionConfig
+from lerobot_latentsafe.evaluation.decision_values import decision_values
+from lerobot_latentsafe.evaluation.rollouts import failures_by_epsilon
+from lerobot_latentsafe.evaluation.statistics import provenance, write_json
+from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+from lerobot_latentsafe.reports.figures import misses_and_alarms, save
 from lerobot_latentsafe.runtime import distributed
 from lerobot_latentsafe.runtime.files import replacing_folder
 from lerobot_latentsafe.runtime.hub import save_policy
@@ -140,12 +160,19 @@ class TrainReachability:
 
 @dataclass
 class Calibrate:
-    """Choose the smallest epsilon that warns in time on held-out failing episodes, and store the evidence.
+    """Choose the smallest epsilon that provably misses few failures, on held-out episodes, and store the evidence.
 
-    latentsafe calibrate --policy.path=outputs/filter --dataset.repo_id=me/held_cache \\
-      --dataset.root=data/held_tokens --output_dir=outputs/calibrated
+    latentsafe calibrate --policy.path=outputs/filter --base_policy_path=me/my_policy --dataset.repo_id=me/held_cache \\
+      --dataset.root=data/held_tokens --alpha=0.05 --output_dir=outputs/calibrated
 
-    Give episodes that the filter was not trained on. The filter with its new epsilon is written to --output_dir.
+    Give episodes of the policy that is to be shielded, which the filter was not trained on. A failing episode is
+    missed where V, as the filter would decide by it, stays above epsilon until --lead_steps before the failure. At most
+    a share --alpha of failing episodes is missed, on average over calibrations; what holds with 95% confidence is said
+    beside it. That takes 9, 19, 49 or 99 failing episodes for 10, 5, 2 or 1%. The filter with its epsilon is written
+    to --output_dir.
+
+    With --closed_loop the shielded policy is run in --env.type, too, at each of --epsilons, and epsilon is the least
+    cautious of those by which it provably fails in at most --alpha of the episodes.
     """
 
     policy: PolicySource
@@ -154,23 +181,97 @@ class Calibrate:
     dataset: DatasetSource = field(default_factory=DatasetSource)
     n_episodes: int = 200
     """Episodes used at most, the last ones of the dataset, if --dataset.episodes names none."""
-    max_missed: float = 0.05
-    """Share of failing episodes that may be warned about too late."""
+    base_policy_path: str | None = None
+    """The policy that was recorded and is to be shielded: a folder, a Hub id, or the name of a committed checkpoint."""
+    alpha: float = 0.05
+    """Share of failing episodes that may be missed."""
     lead_steps: int = 3
     """Frames of warning asked for before the failure."""
+    max_false_alarms: float | None = None
+    """Refuse an epsilon by which more than this share of safe episodes may be overridden; by default any share."""
+    by: str | None = None
+    """Keep --alpha in each group: a column of the dataset, such as policy, or a JSON file, {group: [episodes]}."""
+    weights: Path | None = None
+    """Likelihood ratio of each episode for a use that differs from the recording: JSON, episode: weight, or .npy."""
+    closed_loop: bool = False
+    """Run the shielded policy at each of --epsilons, and choose by what then fails."""
+    env: EnvConfig | None = None
+    """Where it is run."""
+    epsilons: list[float] = field(default_factory=lambda: [0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1, 0.0])
+    """Tried in this order, the most cautious first, as long as they prove safe."""
+    n_runs: int = 100
+    """Episodes run at each epsilon."""
+    seed: int = 0
+    """Of the first of them."""
+    json: Path | None = None
+    """Where to write the scores of all episodes, and misses and false alarms at every epsilon."""
+    figure: Path | None = None
+    """Where to draw misses and false alarms at every epsilon, .png."""
 
     def __post_init__(self) -> None:
         require_at_least("--n_episodes", self.n_episodes, 1)
-        check_options(self.max_missed, self.lead_steps)
+        require_at_least("--n_runs", self.n_runs, 1)
+        require_at_least("--seed", self.seed, 0)
+        check_options(self.alpha, self.lead_steps, self.max_false_alarms)
+        if self.by and self.weights:
+            raise ValueError(f"--by={self.by} and --weights={self.weights}: a group has no weights; give one of them")
+        if self.closed_loop:
+            self._check_closed_loop()
+
+    def _check_closed_loop(self) -> None:
+        if self.env is None:
+            raise ValueError("--closed_loop runs the shielded policy, but where? Give --env.type")
+        if not self.epsilons or any(not later < sooner for sooner, later in pairwise(self.epsilons)):
+            raise ValueError(f"--epsilons is {self.epsilons}; expected falling numbers, such as [0.6,0.4,0.2]")
+        if self.n_runs < needed_for_sure(self.alpha):
+            raise ValueError(
+                f"--n_runs is {self.n_runs}; --alpha={self.alpha:g} takes {needed_for_sure(self.alpha)} runs of which "
+                "none fails"
+            )
 
     def run(self) -> None:
-        """Choose, save, and print what it was chosen on."""
+        """Judge, choose, save, and say what it was chosen on."""
         with replacing_folder(self.output_dir) as folder:
             policy, reader = load_with_cache(self.policy.path, self.dataset.metadata())
-            episodes = self.dataset.of(reader.labels.episode, self.n_episodes)
-            found = calibrate(episode_values(policy.model, reader, episodes), self.max_missed, self.lead_steps)
-            store(policy.config, found)
+            if self.base_policy_path:
+                policy.attach(self.base_policy_path)
+            found, epsilon = self._choose(policy, reader)
+            policy.take_calibration(found, epsilon)
             policy.config.change(frame_cache=None)
             save_policy(policy, folder)
-        for name, value in asdict(found).items():
-            print(f"{name:18s} {value:g}")
+        print(f"epsilon {epsilon:g}", in_words(found), f"wrote {self.output_dir}", sep="\n")
+
+    def _choose(self, policy: LatentSafePolicy, reader: ClipReader) -> tuple[Calibration, float]:
+        """What the episodes say, and the epsilon that follows."""
+        episodes = self.dataset.of(reader.labels.episode, self.n_episodes)
+        marks = episode_marks(reader.labels.episode, reader.state, reader.action)
+        known = refuse_trained_on(policy.config.trained_on, marks, episodes)
+        groups = groups_of(self.dataset.metadata(), self.by, episodes) if self.by else None
+        weights = weights_of(self.weights, episodes) if self.weights else None
+        scores = Scores.of(decision_values(policy.model, reader, episodes), self.lead_steps)
+        scores.require_both(self.lead_steps)
+        self._write(scores)
+        trained_on, law = policy.config.trained_on, policy.config.law
+        floor = -1.0 if law.name == "risk" else 0.0
+        found = calibrate(
+            scores, self.alpha, self.lead_steps, trained_on.fps, floor=floor, groups=groups, weights=weights
+        )
+        if self.max_false_alarms is not None:
+            require_few_alarms(found, scores, self.max_false_alarms)
+        found, epsilon = replace(found, trained_on_known=known), found.epsilon
+        if self.closed_loop:
+            runs = failures_by_epsilon(policy, self.env, self.epsilons, self.n_runs, self.seed)
+            found = replace(found, closed_loop=fixed_sequence(runs, self.alpha))
+            epsilon = proven(found.closed_loop)
+        self._write(scores, found)
+        return found, epsilon
+
+    def _write(self, scores: Scores, found: Calibration | None = None) -> None:
+        """Scores and curve, and once it is chosen the choice: before anything is refused, so that one sees why."""
+        if self.json:
+            chosen = found.as_json() if found else None
+            rows = {"failing": scores.failing, "safe": scores.safe}
+            made = provenance(seeds=[self.seed])
+            write_json(self.json, {"calibration": chosen, **rows, "curve": curve(scores), **made})
+        if self.figure:
+            save(misses_and_alarms(curve(scores), self.alpha, found.epsilon if found else None), self.figure)

@@ -1,6 +1,8 @@
 """What tells the episodes of a dataset apart, whatever their names, videos and added columns: their numbers."""
 
 import hashlib
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,8 +10,16 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from lerobot_latentsafe.datasets.label_places import UnlabelledDatasetError
+from lerobot_latentsafe.units import TrainedOn
 
 TELLING = ("action", "observation.state")
+SHORT = 8
+"""Hex digits that a filter keeps of each episode that it was trained on: of a thousand of those and a hundred others,
+one in forty thousand is taken for one of them."""
+
+
+class TrainedOnError(ValueError):
+    """Episodes that were held out are among those trained on: what a filter says of them promises nothing."""
 
 
 def telling_columns(root: Path) -> list[str]:
@@ -60,3 +70,51 @@ def episode_spans(episode: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             "missing. Download or restore the whole dataset"
         )
     return start, np.diff(np.r_[start, len(episode)])
+
+
+# -- what was trained on ---
+
+
+def episode_marks(episode: np.ndarray, state: np.ndarray, action: np.ndarray) -> dict[int, str]:
+    """Episode -> short fingerprint, from the episode (N,), state (N, S) and action (N, A) of each frame."""
+    frames = {"action": action, "observation.state": state}
+    numbers, start, length = np.unique(episode, return_index=True, return_counts=True)
+    return {
+        int(number): fingerprint(frames, [*frames], slice(first, first + n))[:SHORT]
+        for number, first, n in zip(numbers, start, length)
+    }
+
+
+def with_episodes(known: TrainedOn, marks: dict[int, str], chosen: Sequence[int] | None = None) -> TrainedOn:
+    """What is known of a training with these episodes beside those before; what was unknown before stays unknown.
+
+    Args:
+        marks: of all episodes of a dataset.
+        chosen: those that are trained on; None: all.
+    """
+    if known.episodes is None and known.has_reached("world_model"):
+        return known
+    added = {mark for episode, mark in marks.items() if chosen is None or episode in chosen}
+    return replace(known, episodes="".join(sorted(added | _kept(known))))
+
+
+def _kept(known: TrainedOn) -> set[str]:
+    joined = known.episodes or ""
+    return {joined[i : i + SHORT] for i in range(0, len(joined), SHORT)}
+
+
+def refuse_trained_on(known: TrainedOn, marks: dict[int, str], chosen: np.ndarray | Sequence[int]) -> bool:
+    """Refuse held-out episodes that were trained on; returns whether that is known at all.
+
+    Raises:
+        TrainedOnError: naming how many, and which.
+    """
+    trained = _kept(known)
+    same = [int(episode) for episode in chosen if marks[int(episode)] in trained]
+    if same:
+        raise TrainedOnError(
+            f"{len(same)} of the {len(chosen)} held-out episodes were trained on: {', '.join(map(str, same[:8]))}"
+            f"{', ...' if len(same) > 8 else ''}. What a filter says of them promises nothing of others: name episodes "
+            "that it has not seen (--dataset.episodes), or record new ones"
+        )
+    return known.episodes is not None

@@ -6,7 +6,7 @@ something accumulates it from the steps: rates here, tables of a study in `exper
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -348,6 +348,25 @@ def compare(
         "reasons": count_reasons([reason for trace in shielded.traces for reason in trace["reason"]]),
         "episodes": {"bare": bare, "shielded": shielded},
     }
+
+
+def failures_by_epsilon(
+    policy: LatentSafePolicy, env: EnvConfig, epsilons: Sequence[float], n_episodes: int, seed: int
+) -> Iterator[tuple[float, int, int]]:
+    """Epsilon, failures and episodes of the shielded policy, one epsilon after the other, from the same starts.
+
+    The filter's law stays with the last of them.
+
+    Raises:
+        ValueError: nothing to shield, or an environment that is not the filter's.
+    """
+    check_environment(policy, env)
+    if policy.base is None:
+        raise ValueError("nothing to shield: give --base_policy_path, or a checkpoint written by latentsafe wrap")
+    for epsilon in epsilons:
+        policy.config.change(law=replace(policy.config.law, epsilon=epsilon))
+        runs = run_episodes(policy, env, n_episodes, seed)
+        yield epsilon, int(runs.violation.sum()), n_episodes
 
 
 def count_reasons(reasons: np.ndarray | list[int]) -> dict[str, int]:

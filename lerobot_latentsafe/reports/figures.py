@@ -119,6 +119,48 @@ def imagined_futures(
     return figure
 
 
+def misses_and_alarms(rows: list[dict[str, float]], alpha: float, chosen: float | None = None) -> Figure:
+    """Shares of missed failing episodes and of overridden safe ones over epsilon, each below its 95% bound.
+
+    Args:
+        rows: see `calibration.curve`.
+        alpha: share of misses that was asked for.
+        chosen: epsilon.
+    """
+    figure, ax = plt.subplots(figsize=(6, 3.4))
+    epsilon = [row["epsilon"] for row in rows]
+    kinds = (("missed", "failing, missed", "tab:red"), ("false_alarms", "safe, overridden", "tab:blue"))
+    for name, what, colour in kinds:
+        share, bound = ([100 * row[key] for row in rows] for key in (name, f"{name}_at_most"))
+        ax.step(epsilon, share, where="post", color=colour, label=what)
+        ax.fill_between(epsilon, share, bound, step="post", color=colour, alpha=0.15)
+    ax.axhline(100 * alpha, color="tab:red", lw=0.8, ls=":", label=f"alpha = {alpha:.3g}")
+    if chosen is not None:
+        ax.axvline(chosen, color="k", lw=0.8, ls="--", label=f"epsilon = {chosen:.3g}")
+    ax.set(xlabel="epsilon", ylabel="episodes (%); shaded: up to the 95% bound", ylim=(-2, 102))
+    ax.legend(fontsize=8)
+    return figure
+
+
+def causes_of_misses(studies: dict[str, dict[str, int]]) -> Figure:
+    """A bar for each study: of its missed episodes, the share due to each cause.
+
+    Args:
+        studies: name -> cause -> missed episodes.
+    """
+    figure, ax = plt.subplots(figsize=(6.4, 1.1 + 0.5 * len(studies)))
+    names = [f"{name} (n = {sum(causes.values())})" for name, causes in studies.items()]
+    left = np.zeros(len(studies))
+    for cause in next(iter(studies.values())):
+        share = np.array([100 * causes[cause] / max(1, sum(causes.values())) for causes in studies.values()])
+        ax.barh(names, share, left=left, label=cause.replace("_", " "))
+        left += share
+    ax.set(xlabel="missed failing episodes (%)", xlim=(0, 100))
+    ax.invert_yaxis()
+    ax.legend(fontsize=8, ncols=5, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    return figure
+
+
 def write_videos(runs: dict[str, Episodes], folder: str | Path, fps: int = car.FPS) -> list[Path]:
     """One mp4 an episode, bare and shielded side by side, an orange frame while the filter acts."""
     paths = []

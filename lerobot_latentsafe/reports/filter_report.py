@@ -8,13 +8,14 @@ import numpy as np
 import torch
 from lerobot.envs.configs import EnvConfig
 
+from lerobot_latentsafe.calibration import Calibration, in_words
 from lerobot_latentsafe.datasets.episodes import DatasetFrames
 from lerobot_latentsafe.decision import Reason
 from lerobot_latentsafe.evaluation.nearest_frames import NearestFrames
 from lerobot_latentsafe.evaluation.rollouts import Episodes, check_environment, compare, count_reasons
 from lerobot_latentsafe.evaluation.statistics import provenance, wilson
 from lerobot_latentsafe.latent import Latent
-from lerobot_latentsafe.model_card import fallback, rate_in_words, threshold
+from lerobot_latentsafe.model_card import fallback, how_epsilon_was_set, rate_in_words, threshold
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.reports import figures, html
 from lerobot_latentsafe.reports.recorded_episodes import RecordedEpisodes
@@ -37,6 +38,7 @@ INTRODUCTION = (
 def write_filter_report(
     path: Path, policy: LatentSafePolicy, env: EnvConfig | None, n_episodes: int, seed: int,
     recorded: DatasetFrames | None = None, extra: Extra | None = None,
+    misses: dict[str, dict[str, int]] | None = None,
 ) -> None:  # fmt: skip
     """Write the report.
 
@@ -45,6 +47,7 @@ def write_filter_report(
         recorded: a dataset; what `latentsafe record` stored is shown, and where the world model cannot draw, its frames
             illustrate what was imagined, beside those of the episodes that are run.
         extra: what to add of the environment.
+        misses: study -> cause -> episodes that were not warned of in time; see `evaluation.misses`.
 
     Raises:
         ValueError: nothing is run, and the dataset was not recorded under a filter.
@@ -59,7 +62,7 @@ def write_filter_report(
     if seen is not None and recorded is not None:
         seen.add_dataset(recorded)
     with TemporaryDirectory() as folder:
-        parts = [html.paragraph(INTRODUCTION), *_about(policy)]
+        parts = [html.paragraph(INTRODUCTION), *_about(policy), *_misses(misses or {}, Path(folder))]
         if env is not None:
             parts += _evaluation(policy, env, n_episodes, seed, Path(folder), seen, extra)
         if recorded is not None and RecordedEpisodes.is_one(recorded):
@@ -93,24 +96,33 @@ def _evaluation(
 
 
 def _about(policy: LatentSafePolicy) -> list[str]:
-    config, trained_on, found = policy.config, policy.config.trained_on, policy.config.calibration
-    evidence = "set by hand"
-    if found:
-        evidence = (
-            f"chosen on {found['failing_episodes']:.0f} failing episodes it had not seen: {found['missed']:.1%} warned "
-            f"too late, {found['false_alarms']:.1%} of safe frames alarmed"
-        )
+    config, trained_on, outdated = policy.config, policy.config.trained_on, policy.outdated()
+    set_how = how_epsilon_was_set(config.calibration, outdated)
     ranges = [f"{name} from {low:.3g} to {high:.3g}" for name, (low, high) in trained_on.ranges.items()]
     rows = [
         ["sees", f"{', '.join(trained_on.cameras)}; {', '.join(trained_on.state_names)}"],
         ["acts on", ", ".join(ranges)],
         ["rate", f"{trained_on.fps} steps a second"],
         ["failure means", f"the recordings' label {config.margin.failure_specification!r}"],
-        ["threshold", f"epsilon = {threshold(config.law)}, {evidence}"],
+        ["threshold", f"epsilon = {threshold(config.law)}, set {set_how}"],
         ["fallback", fallback(config.law)],
         ["mode", "overrides unsafe actions" if config.law.mode == "filter" else "only watches"],
     ]
-    return [html.heading("The filter"), html.table(["", ""], rows)]
+    found = None if outdated else Calibration.read(config.calibration)
+    promise = [] if found is None else [html.heading("How often it misses"), html.paragraph(in_words(found))]
+    return [html.heading("The filter"), html.table(["", ""], rows), *promise]
+
+
+def _misses(misses: dict[str, dict[str, int]], folder: Path) -> list[str]:
+    """Which part of the filter is to blame for what was missed: a bar for each study."""
+    if not misses:
+        return []
+    figures.save(figures.causes_of_misses(misses), folder / "misses.png")
+    caption = (
+        "Recorded failures that were not warned of in time. Doomed: they failed at once. Fallback: V fell to epsilon, "
+        "but late. Margin: blind to the failure. World model: imagined otherwise than it came. Value: it saw a way out."
+    )
+    return [html.heading("Where misses come from"), html.picture(folder / "misses.png", caption)]
 
 
 def _comparison(result: dict, folder: Path) -> list[str]:

@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import draccus
+import torch
 from huggingface_hub import constants, snapshot_download
 from lerobot.configs.policies import PreTrainedConfig
 from safetensors import SafetensorError, safe_open
+from torch import Tensor
 
 from lerobot_latentsafe.runtime.files import locked_folder, replacing_folder, scratch_folder
 
@@ -200,6 +202,19 @@ def _check_tensors(file: Path) -> None:
 def _digest(file: Path) -> str:
     with file.open("rb") as content:
         return hashlib.file_digest(content, "sha256").hexdigest()
+
+
+def weights_digest(weights: dict[str, Tensor]) -> str:
+    """What tells weights apart, name -> tensor, wherever they lie: SHA-256 of their numbers in order.
+
+    Fractions count in half precision, as they may be stored.
+    """
+    known = hashlib.sha256()
+    for tensor in weights.values():
+        numbers = tensor.detach().cpu()
+        numbers = numbers.half() if numbers.is_floating_point() else numbers
+        known.update(numbers.contiguous().reshape(-1).view(torch.uint8).numpy())
+    return known.hexdigest()
 
 
 def _entry(config: dict[str, Any], name: str) -> dict[str, Any]:

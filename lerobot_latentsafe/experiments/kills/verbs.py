@@ -72,7 +72,7 @@ VERBS = {
         f"train-reachability --policy.path={{made}}/{MODEL} {data('car_cache')} --output_dir={{out}}/out --steps=300"
     ),
     "train-dreamer": Verb(DREAMER),
-    "calibrate": Verb(f"calibrate --policy.path={{made}}/{FILTER} {data('car_cache')} --output_dir={{out}}/out"),
+    "calibrate": Verb(f"calibrate --policy.path=dubins {data('car_cache')} --alpha=0.3 --output_dir={{out}}/out"),
     "report": Verb(
         f"report --policy.path={{made}}/{FILTER} --env.type=latentsafe_dubins --env.episode_length=8 --n_episodes=2 "
         "--base_policy_path=dubins_diffusion_reckless --output={out}/out/report.html"

@@ -1,0 +1,1 @@
+"""How far what is promised of a filter holds."""
