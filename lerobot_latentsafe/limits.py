@@ -134,7 +134,7 @@ class Limits:
         return any_of(far)
 
     def slowed(self, action: np.ndarray, hold: np.ndarray, share: float) -> np.ndarray:
-        """So much of the motion of actions from what would be to stay, both (B, A); frozen commands and switches pass."""
+        """This share of the way from what would be to stay to actions, both (B, A); frozen commands pass."""
         return np.where(self.frozen, action, hold + np.float32(share) * (action - hold))
 
     def hold(self, state: np.ndarray, told: np.ndarray | None = None, settled: np.ndarray | None = None) -> np.ndarray:

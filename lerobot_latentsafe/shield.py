@@ -221,7 +221,7 @@ class Shield:
             decision,
             unknown=torch.from_numpy(monitor.share),
             hand_over=torch.from_numpy((alarms != Reason.PASSED) & (law.unknown == "hand_over")),
-            drift=torch.full((len(alarms),), monitor.drift.evidence),
+            drift=torch.full((len(alarms),), monitor.evidence),
         )
 
     def _say_if_disarmed(self) -> None:

@@ -149,13 +149,12 @@ class UnknownMonitor:
         """End an episode, which counts if anything was seen in it, and begin the next."""
         for strangest in self._strangest[np.isfinite(self._strangest)].tolist():
             self.drift.add(strangest)
-        evidence = self.drift.evidence
-        if evidence >= 1 / self.alpha and not self._told_drift:
+        if self.evidence >= 1 / self.alpha and not self._told_drift:
             self._told_drift = True
             logger.warning(
                 "THE WORLD HAS DRIFTED: episodes of this session are stranger than those that the monitor was fitted "
                 "on (E = %.3g, expected below %.3g). Record episodes of the world as it is now, and fit the monitor "
-                "again (latentsafe monitor)", evidence, 1 / self.alpha,
+                "again (latentsafe monitor)", self.evidence, 1 / self.alpha,
             )  # fmt: skip
         self._tick, self._strangest = 0, np.zeros(0)
         self._since: np.ndarray | None = None
@@ -178,15 +177,24 @@ class UnknownMonitor:
         strange = self._standardised(scores, slice(0, scores.shape[1]))
         strange[~seen] = np.nan
         self.share = self._note(strange, Reason.UNKNOWN_APPEARANCE)
-        self._since = np.where(self.share > 1, 0, self._since + 1)  # of one that is not seen, time goes on
+        self._since = np.where(self.share > 1, 0, self._since + seen)
         return self.alarms
 
     def foresee(self, differences: np.ndarray) -> np.ndarray:
-        """Go on with a tick by what was foretold of it: differences (B, H, D), NaN where nothing was. The alarms (B,)."""
+        """Go on with a tick by what was foretold of it. Returns the alarms that hold, a `Reason` each: (B,).
+
+        Args:
+            differences: (B, H, D); NaN where nothing was foretold.
+        """
         scores = self.familiar.surprises(differences)
         share = self._note(self._standardised(scores, slice(-scores.shape[1], None)), Reason.UNKNOWN_DYNAMICS)
         self.share, self._surprised = np.maximum(self.share, share), self._surprised | (share > 1)
         return self.alarms
+
+    @property
+    def evidence(self) -> float:
+        """E, see `Drift`."""
+        return self.drift.evidence
 
     def end_tick(self) -> None:
         """Time goes on."""
