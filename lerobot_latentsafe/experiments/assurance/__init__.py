@@ -1,0 +1,1 @@
+"""What can be promised of a filter: how often it misses, and whether it says that the scene is new."""
