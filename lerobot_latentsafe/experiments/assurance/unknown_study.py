@@ -189,22 +189,22 @@ def _policy(path: str) -> LatentSafePolicy:
 def run(folder: Path, job: dict) -> dict:
     """When an episode alarms, and when it does harm: the first tick of each or None, and M as a share of the threshold.
 
-    A fault of a camera is scored by the appearance alone, which is all that tells it before anything happens.
+    A fault of a camera, and whatever a monitor without dynamics sees, is scored by the appearance alone.
     """
     policy, episode = _policy(job["policy"]), recorded(folder, job["kind"], job["seed"])
     familiar, record = policy.model.familiar, policy.config.trained_on.monitor
     pictures = episode["pictures"] if job["fault"] is None else FAULTS[job["fault"]](episode["pictures"])
     shown = torch.from_numpy(np.ascontiguousarray(pictures, dtype=np.uint8))
-    keys = [f"observation.images.{camera}" for camera in CAMERAS]
-    if job["fault"] is None:
-        ticks = ({key: shown[t : t + 1, i] for i, key in enumerate(keys)} for t in range(len(shown)))
+    by_camera = {f"observation.images.{camera}": shown[:, i] for i, camera in enumerate(CAMERAS)}
+    if job["fault"] is None and familiar.usual is not None:
+        ticks = ({key: frames[t : t + 1] for key, frames in by_camera.items()} for t in range(len(shown)))
         found = replayed(policy.model, ticks, episode["state"], episode["action"])
         scores = familiar.scores_of(found.seen, found.differences)
     else:
-        images = {key: shown[:, i].float() / 255.0 for i, key in enumerate(keys)}
-        looks = appearance.strangeness(appearance.views(images, keys), familiar.library).reshape(len(shown), -1)
+        images = {key: frames.float() / 255.0 for key, frames in by_camera.items()}
+        looks = appearance.strangeness(appearance.views(images, [*images]), familiar.library)
         scores = np.full((len(shown), familiar.n_scores), np.nan, np.float32)
-        scores[:, : looks.shape[1]] = looks
+        scores[:, : 2 * familiar.n_cameras] = looks.reshape(len(shown), -1)
     share = familiar.standardised(scores, np.arange(len(scores))) / familiar.threshold(record.rank)
     n_looks = 2 * familiar.n_cameras
     return {
