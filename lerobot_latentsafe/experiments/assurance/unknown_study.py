@@ -10,11 +10,13 @@ from dataclasses import dataclass
 from functools import cache, partial
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 import torch
 
+from lerobot_latentsafe.encoders.perception import Perception
 from lerobot_latentsafe.evaluation.statistics import provenance, run_resumable, wilson, write_json
 from lerobot_latentsafe.experiments.filter_settings import fingerprint
 from lerobot_latentsafe.franka.bag import BagScene, Variant
@@ -172,7 +174,7 @@ def recorded(folder: Path, kind: str, seed: int) -> dict[str, np.ndarray]:
     file = folder / f"{kind.replace(' ', '_')}_{seed}.npz"
     if not file.exists():
         with replacing(file) as partial, partial.open("wb") as stream:
-            np.savez(stream, **record(kind, seed))
+            np.savez(stream, **dict[str, Any](record(kind, seed)))
     with np.load(file) as kept:
         return {name: kept[name] for name in kept.files}
 
@@ -254,7 +256,7 @@ def cost_ms(policy: LatentSafePolicy, episode: dict[str, np.ndarray]) -> dict[st
         seen = {key: shown[i : i + 1] for i, key in enumerate(keys)}
         seen["observation.state"] = torch.from_numpy(episode["state"][t : t + 1])
         for name in (("with", "without"), ("without", "with"))[t % 2]:
-            policy.model.world_model.perception.forget()
+            Perception.forget()  # else the second is told what the first saw
             began = time.thread_time()
             shields[name](seen, torch.from_numpy(episode["action"][t : t + 1]))
             took[name].append(1e3 * (time.thread_time() - began))
