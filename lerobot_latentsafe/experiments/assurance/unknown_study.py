@@ -285,7 +285,7 @@ def study(path: str, folder: Path, n: int, healthy: int, output: Path, workers: 
     record = _policy(path).config.trained_on.monitor
     result = {
         "summary": {
-            "alpha": record.alpha, "episodes": record.episodes, "rank": record.rank,
+            "alpha": record.alpha, "episodes": record.episodes, "rank": record.rank, "dynamics": record.dynamics,
             "healthy_alarmed": table[HEALTHY]["alarmed"],
             "kinds": {kind: table[kind] for kind in KINDS if kind != HEALTHY},
             "camera_faults": {fault: table[fault] for fault in FAULTS},
