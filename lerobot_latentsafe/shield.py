@@ -280,8 +280,8 @@ class Shield:
         before = self._what_led_here(ahead[:, 0])
         belief = self._filter_history(percepts, seen.state, before, blind)
         foretold, differences = self._foretell(belief.latent, before, blind)
-        judgement = Judgement(belief, *self._look_ahead(belief.latent, ahead, hold))
-        judgement = judgement._replace(foretold=foretold, differences=differences)
+        value, margin, fallback, retreats = self._look_ahead(belief.latent, ahead, hold)
+        judgement = Judgement(belief, value, margin, fallback, retreats, foretold, differences)
         return judgement, or_else(faults, first_of({Reason.FILTER_FAILED: on_host(unsound, torch.bool)}))
 
     def _foretell(self, latent: Latent, before: Tensor, blind: Tensor) -> tuple[Foretold, np.ndarray | None]:
