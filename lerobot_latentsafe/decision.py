@@ -10,6 +10,10 @@ from torch import Tensor
 
 LAWS = ("reachability", "risk", "plan", "margin", "guard")
 MODES = ("filter", "monitor")
+ANSWERS = ("warn", "slow", "hold", "hand_over")
+"""What may be done about what is unknown."""
+SLOW = 0.5
+"""Share of a motion that remains of it where things are unknown and the law says `slow`."""
 LONG_AGO_MS = 1000.0
 """What was seen so long ago says nothing of a robot that moves."""
 RECENT = 10
@@ -36,6 +40,8 @@ class Reason(IntEnum):
     OBSERVATION_UNFAMILIAR = 14
     ACTION_JUMPS = 15
     FILTER_FAILED = 16
+    UNKNOWN_APPEARANCE = 17
+    UNKNOWN_DYNAMICS = 18
 
 
 @dataclass
@@ -68,6 +74,8 @@ class LawOptions:
     """By so much an observation may be older than a period when the action leaves."""
     mode: str | None = None
     """filter, or monitor, which never acts and reports what it would have done."""
+    unknown: str | None = None
+    """What is done where the monitor of the unknown alarms: warn, slow, hold or hand_over."""
 
 
 @dataclass
@@ -99,6 +107,9 @@ class LawConfig:
         slack_ms: by so much an observation may be older than a period of the data's rate when the action leaves.
             Beyond that nothing passes.
         mode: `filter` overrides unsafe actions; `monitor` only reports what it would have done.
+        unknown: what is done where the monitor of the unknown alarms, of a filter that has one. `hold` takes it for a
+            fault: the robot stays, or the fallback acts where staying is not found safe. `hand_over` does the same, and
+            the decision asks for a person. `slow` lets half of each motion pass, `warn` all of it. Each of them warns.
     """
 
     name: str = "reachability"
@@ -114,11 +125,13 @@ class LawConfig:
     deadline_ms: float | None = None
     slack_ms: float = 0.0
     mode: str = "filter"
+    unknown: str = "hold"
 
     def __post_init__(self) -> None:
         expected = {
             "name": (self.name in LAWS, f"one of {', '.join(LAWS)}"),
             "mode": (self.mode in MODES, f"one of {', '.join(MODES)}"),
+            "unknown": (self.unknown in ANSWERS, f"one of {', '.join(ANSWERS)}"),
             "lookahead": (0 <= self.lookahead <= 25, "0 (critic alone) to 25 imagined ticks"),
             "proposal_steps": (1 <= self.proposal_steps <= 25, "1 (the paper's law) to 25 steps"),
             "retreat_after": (0 <= self.retreat_after <= RECENT, f"0 (retreat at once) to {RECENT} overrides"),
@@ -147,6 +160,11 @@ class LawConfig:
         """
         given = {f.name: value for f in fields(options) if (value := getattr(options, f.name)) is not None}
         return replace(self, **given)
+
+    @property
+    def stops_at_the_unknown(self) -> bool:
+        """Whether nothing passes where things are unknown."""
+        return self.unknown in ("hold", "hand_over")
 
     @property
     def disarmed(self) -> str | None:
@@ -186,6 +204,11 @@ class FilterDecision:
         reason: int64 (B,), a `Reason`.
         heard: (B, A), the action that was judged, as the world model heard it; of faulty rows that is to stay. None
             where there is none that hears, by the law of a guard.
+        unknown: (B,), how strange things are, as a share of the monitor's threshold: above 1 it alarms. None without a
+            monitor.
+        hand_over: bool (B,), whether a person is asked to take over; None without a monitor.
+        drift: (B,), the evidence E that this session's episodes are not as those that the monitor was fitted on; None
+            without a monitor.
     """
 
     action: Tensor
@@ -196,6 +219,9 @@ class FilterDecision:
     intervened: Tensor
     reason: Tensor
     heard: Tensor | None = None
+    unknown: Tensor | None = None
+    hand_over: Tensor | None = None
+    drift: Tensor | None = None
 
     def to(self, device: torch.device) -> "FilterDecision":
         """The same, on a device."""
@@ -203,6 +229,24 @@ class FilterDecision:
             return self
         numbers = {name: None if value is None else value.to(device) for name, value in vars(self).items()}
         return FilterDecision(**numbers)
+
+
+def heeding(decision: FilterDecision, alarms: np.ndarray, law: LawConfig, slowed: np.ndarray) -> FilterDecision:
+    """A decision on the host, with the alarms of a law that stops nothing because of them.
+
+    Args:
+        alarms: (B,), a `Reason` each; the rows whose proposal passes get it.
+        slowed: (B, A) in robot units, what remains of the proposals by the answer `slow`.
+    """
+    if law.stops_at_the_unknown or not alarms.any():
+        return decision
+    reason = or_else(decision.reason.numpy(), alarms)
+    passes = (decision.reason.numpy() == Reason.PASSED) & (alarms != Reason.PASSED)
+    slows = passes[:, None] & (law.unknown == "slow") & (law.mode == "filter")
+    action = torch.from_numpy(np.where(slows, slowed, decision.action.numpy()))
+    return replace(
+        decision, action=action, unsafe=torch.from_numpy(reason != Reason.PASSED), reason=torch.from_numpy(reason)
+    )
 
 
 class Overrides:

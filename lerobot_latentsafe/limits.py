@@ -133,6 +133,10 @@ class Limits:
             far |= np.abs(action - 2 * before[-1] + before[-2]) > self._largest_jerk
         return any_of(far)
 
+    def slowed(self, action: np.ndarray, hold: np.ndarray, share: float) -> np.ndarray:
+        """This share of the way from what would be to stay to actions, both (B, A); frozen commands pass."""
+        return np.where(self.frozen, action, hold + np.float32(share) * (action - hold))
+
     def hold(self, state: np.ndarray, told: np.ndarray | None = None, settled: np.ndarray | None = None) -> np.ndarray:
         """What to do when nothing can be known: stay (B, A), in robot units.
 

@@ -16,6 +16,8 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_STATE
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from lerobot_latentsafe._compat import EVALUATION, NOT_AVERAGED, ROLLOUT, called_from, training_run
@@ -47,8 +49,12 @@ from lerobot_latentsafe.runtime.processors import check_own_processors
 from lerobot_latentsafe.runtime.time_limit import TimeLimit
 from lerobot_latentsafe.safety_model import SafetyModel, UntrainedFilterError
 from lerobot_latentsafe.shield import Shield
+from lerobot_latentsafe.unknown.monitor import Familiar, StatisticsError
 
 logger = logging.getLogger(__name__)
+
+STATISTICS = "policy_monitor.safetensors"
+"""The file of the monitor's numbers, in a filter's folder; its name is one that a seal covers."""
 
 
 class LatentSafePolicy(PreTrainedPolicy):
@@ -296,6 +302,8 @@ class LatentSafePolicy(PreTrainedPolicy):
                 if self.base:
                     self.base.save(folder / BASE_FOLDER)
                 super()._save_pretrained(folder, state_dict=state_dict)
+                if self.model.familiar is not None:
+                    save_file(self.model.familiar.tensors(), folder / STATISTICS)
                 seal(folder, SEALED_ENTRIES)
         finally:
             config.base_policy_path = base_path
@@ -326,14 +334,56 @@ class LatentSafePolicy(PreTrainedPolicy):
                 policy = super().from_pretrained(folder, config=config, strict=True, **kwargs)
         finally:
             config.base_policy_path = chosen
+        if config.trained_on.monitor is not None:
+            policy.monitor_by(_familiar(folder, policy.model))
         if base is not None:
             policy.attach(base)
         return policy
+
+    def monitor_by(self, familiar: Familiar) -> None:
+        """Watch for the unknown by these numbers, in a shield that remembers nothing yet."""
+        self.model.familiar = familiar
+        self.shield = Shield(self.model)
 
     def generate_model_card(self, dataset_repo_id: str, model_type: str, license: str | None,
                             tags: list[str] | None, cfg=None, dataset_meta=None) -> ModelCard:  # fmt: skip
         """A card that says what the filter was trained on, how epsilon was set, and what it is not."""
         return make_model_card(self.config, dataset_repo_id, license, tags, self.outdated())
+
+
+def world_model_digest(model: SafetyModel) -> str:
+    """Identifies the weights of a world model."""
+    return weights_digest(model.world_model.state_dict())[:16]
+
+
+def _familiar(folder: Path, model: SafetyModel) -> Familiar:
+    """The numbers of a filter's monitor.
+
+    Raises:
+        CheckpointError: they are missing, not readable, or of another monitor, camera or world model.
+    """
+    file, record, again = (
+        folder / STATISTICS,
+        model.config.trained_on.monitor,
+        "fit the monitor again: latentsafe monitor",
+    )
+    if not file.is_file():
+        raise CheckpointError(f"{file} is missing, and the filter has a monitor of the unknown; {again}")
+    try:
+        found = Familiar.of(load_file(file))
+    except (SafetensorError, OSError, StatisticsError) as e:
+        raise CheckpointError(f"{file} is not readable ({e}); {again}") from e
+    image_keys, size = list(model.world_model.image_keys), model.config.world_model.image_size
+    for what, known, used in (
+        ("numbers", record.statistics, found.digest()),
+        ("cameras", record.cameras, image_keys),
+        ("number of cameras", len(record.cameras), found.n_cameras),
+        ("image_size", record.image_size, size),
+        ("world model", record.world_model, world_model_digest(model)),
+    ):
+        if known != used:
+            raise CheckpointError(f"the monitor of {folder} was fitted with {what} {known}, and finds {used}; {again}")
+    return found
 
 
 def _check(folder: Path, config: PreTrainedConfig, training: bool) -> None:

@@ -23,6 +23,7 @@ from lerobot_latentsafe.meanings import MeaningError
 from lerobot_latentsafe.pictures import to_model_images
 from lerobot_latentsafe.reachability import look_ahead
 from lerobot_latentsafe.units import Units
+from lerobot_latentsafe.unknown.monitor import Familiar, StatisticsError
 from lerobot_latentsafe.world_models.base import WorldModel
 
 
@@ -79,6 +80,7 @@ class SafetyModel(nn.Module):
         units: normalises and denormalises.
         limits: of what the robot can show and may be told.
         world_model, margin, critic: the parts.
+        familiar: what the monitor of the unknown has learned; None where there is none.
         lacks_weights: whether the configuration speaks of trained weights, and nothing was loaded or trained since.
 
     Raises:
@@ -102,6 +104,7 @@ class SafetyModel(nn.Module):
             self.world_model = config.world_model.build(trained_on.cameras, *sizes)
         config.change(world_model=self.world_model.config)
         self._perhaps_targets = trained_on.perhaps_targets(config.fallback.frozen_commands)
+        self.familiar: Familiar | None = None
         self.margin = self.new_margin()
         self.critic = self.new_critic()
         self.lacks_weights = trained_on.has_reached("world_model")
@@ -221,6 +224,11 @@ class SafetyModel(nn.Module):
             MeaningError: a filter of a version before 0.3, to which joint targets were motions: its hold is a jump.
         """
         self.require_stage(self._stage_of_law)
+        if self.familiar is None and self.config.trained_on.monitor is not None:
+            raise StatisticsError(
+                "this filter's monitor of the unknown has no statistics: its configuration was read, its files were "
+                "not. Load both with LatentSafePolicy.from_pretrained(folder)"
+            )
         if self._perhaps_targets:
             raise MeaningError(
                 f"this filter was trained by a version before 0.3 and may take {', '.join(self._perhaps_targets)} for "

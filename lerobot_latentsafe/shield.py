@@ -20,11 +20,13 @@ from torch import Tensor
 
 from lerobot_latentsafe.configuration_latentsafe import SEALED
 from lerobot_latentsafe.decision import (
+    SLOW,
     FilterDecision,
     Overrides,
     Reason,
     by_checks_alone,
     first_of,
+    heeding,
     least_restrictive,
     or_else,
 )
@@ -34,6 +36,8 @@ from lerobot_latentsafe.latent import Belief, Latent, is_sound, map_latent, repl
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
 from lerobot_latentsafe.runtime.time_limit import TimeLimit
 from lerobot_latentsafe.safety_model import SafetyModel
+from lerobot_latentsafe.unknown.dynamics import Foretold, ages
+from lerobot_latentsafe.unknown.monitor import UnknownMonitor
 
 logger = logging.getLogger(__name__)
 
@@ -46,6 +50,8 @@ class Judgement(NamedTuple):
         value, margin: (B,), V of the action and l now; NaN where nothing can be known.
         fallback: (B, A) in robot units.
         retreats: bool (B,), whether an override would be the retreat's.
+        foretold: of the next frame that this belief will see.
+        differences: (B, H, D), what was foretold minus what is believed now; None without a monitor that foretells.
     """
 
     belief: Belief
@@ -53,6 +59,8 @@ class Judgement(NamedTuple):
     margin: np.ndarray
     fallback: np.ndarray
     retreats: np.ndarray
+    foretold: Foretold = Foretold()
+    differences: np.ndarray | None = None
 
 
 class Shield:
@@ -67,6 +75,7 @@ class Shield:
 
     Attributes:
         guard: checks what is seen and told.
+        monitor: of the unknown; None where the filter has none. It remembers the session's episodes.
         pace: of the decisions.
         beliefs: of the episode, by the frames that the world model has seen: where its step is several ticks, every so
             many frames, beginning with one, with the next, and so on. The first is the one that sees the next frame.
@@ -77,6 +86,7 @@ class Shield:
 
     def __init__(self, model: SafetyModel, clock: Callable[[], float] = time.perf_counter):
         self.model, self.clock, self.guard = model, clock, Guard(model)
+        self.monitor = monitor_of(model)
         self.pace = Pace(model.config.trained_on.fps)
         self.failures: Counter[str] = Counter()
         self.took_s, self._warm = 0.0, False
@@ -101,8 +111,12 @@ class Shield:
 
     def _forget(self) -> None:
         self.guard.reset()
+        if self.monitor is not None:
+            self.monitor.reset()
         skip = self.model.config.world_model.frame_skip
         self.beliefs = deque([Belief()] * skip, maxlen=skip)
+        self.foretold = deque([Foretold()] * skip, maxlen=skip)
+        self._in_sight: np.ndarray | None = None
         self._told_at: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=skip)
         self.observed: dict[str, Tensor] | None = None
         self.decision: FilterDecision | None = None
@@ -171,19 +185,44 @@ class Shield:
             hold = self.guard.hold(seen.state)
             faults, wanted, clipped = self.guard.check_action(proposed, faults, hold, missing_reason, planned)
             faults = or_else(faults, fault or rate)
+            alarms = self._look_for_the_unknown(seen, faults)
+            faults = or_else(faults, alarms) if law.stops_at_the_unknown else faults
             self.overrides = self.overrides or Overrides(len(hold))
             # What is wrong is not judged: in its place stands what would be done instead, to stay.
             judged = np.where((faults != Reason.PASSED)[:, None], hold, clipped)
             heard = None if law.name == "guard" else self._hear(judged, self.guard.pose)
             ahead = None if heard is None else self._hear_ahead(heard, faults, coming)
             judgement, faults = self._judge(seen, faults, ahead, hold, self.patience(len(hold)))
+            if judgement.differences is not None:
+                alarms = self.monitor.foresee(judgement.differences)
+                faults = or_else(faults, alarms) if law.stops_at_the_unknown else faults
             self.took_s = self.clock() - started
             faults = self._late(faults, age_s + self.took_s, Reason.DEADLINE_MISSED, len(hold), self.took_s)
             decision = self._decide(judgement, seen, faults, hold, wanted, clipped)
+            if self.monitor is not None:
+                decision = self._with_the_unknown(decision, alarms, hold)
             self._remember(judgement, decision, observation)
             decision = replace(decision, heard=heard).to(self.model.device)
             self.decision = replace(decision, action=decision.action.clone())  # what is returned is the caller's
             return decision
+
+    def _look_for_the_unknown(self, seen: Seen, faults: np.ndarray) -> np.ndarray:
+        """What the monitor of the unknown says of what is seen, a `Reason` each (B,); faulty pictures say nothing."""
+        if self.monitor is None:
+            return np.zeros_like(faults)
+        return self.monitor.look(seen.images, ~np.isin(faults, UNSEEN))
+
+    def _with_the_unknown(self, decision: FilterDecision, alarms: np.ndarray, hold: np.ndarray) -> FilterDecision:
+        """The decision with what the monitor found, and with what the law does about it beside stopping."""
+        law, monitor = self.model.config.law, self.monitor
+        slowed = self.model.limits.slowed(decision.action.numpy(), hold, SLOW)
+        decision = heeding(decision, alarms, law, slowed)
+        return replace(
+            decision,
+            unknown=torch.from_numpy(monitor.share),
+            hand_over=torch.from_numpy((alarms != Reason.PASSED) & (law.unknown == "hand_over")),
+            drift=torch.full((len(alarms),), monitor.evidence),
+        )
 
     def _say_if_disarmed(self) -> None:
         """Warn once of each law that does not heed what is seen."""
@@ -235,12 +274,35 @@ class Shield:
 
     def _imagine(self, seen: Seen, faults: np.ndarray, ahead: Tensor, hold: np.ndarray) -> tuple[Judgement, np.ndarray]:
         """Take in what is seen, and look ahead; changes nothing here, as it may be late."""
-        percepts = self.model.world_model.perceive(seen.images)
+        percepts = self._perceive(seen)
         unsound = ~is_sound(percepts)
         blind = self.model.tensor(np.isin(faults, UNSEEN)) | (self.model.tensor(faults == Reason.PASSED) & unsound)
-        belief = self._filter_history(percepts, seen.state, ahead[:, 0], blind)
-        judgement = Judgement(belief, *self._look_ahead(belief.latent, ahead, hold))
+        before = self._what_led_here(ahead[:, 0])
+        belief = self._filter_history(percepts, seen.state, before, blind)
+        foretold, differences = self._foretell(belief.latent, before, blind)
+        value, margin, fallback, retreats = self._look_ahead(belief.latent, ahead, hold)
+        judgement = Judgement(belief, value, margin, fallback, retreats, foretold, differences)
         return judgement, or_else(faults, first_of({Reason.FILTER_FAILED: on_host(unsound, torch.bool)}))
+
+    def _perceive(self, seen: Seen) -> dict[str, Tensor]:
+        return self.model.world_model.perceive(seen.images)
+
+    def _foretell(self, latent: Latent, before: Tensor, blind: Tensor) -> tuple[Foretold, np.ndarray | None]:
+        """What is foretold of this frame, in place of what was of the last one, and how it differs from the belief.
+
+        What began or ends where nothing was seen says nothing of the world.
+        """
+        if self.monitor is None or not self.monitor.foretells:
+            return Foretold(), None
+        model, of_ages = self.model.world_model, ages(self.model.config.world_model.frame_skip)
+        began, foretold = self.beliefs[0].latent, Foretold()
+        if began is not None:
+            foretold = self.foretold[0].after(began, model.step, before, of_ages[-1])
+        differences = foretold.differences(model.features, latent, of_ages)
+        in_sight = np.zeros(len(differences)) if self._in_sight is None else self._in_sight
+        old = np.array(of_ages) * self.model.config.world_model.frame_skip
+        differences[(in_sight[:, None] < old) | on_host(blind, torch.bool)[:, None]] = np.nan
+        return foretold, differences
 
     def _look_ahead(self, latent: Latent, ahead: Tensor, hold: np.ndarray) -> tuple[np.ndarray, ...]:
         """V of actions (B, K, A), l now (B,); the fallback (B, A); whether an override would be the retreat's (B,)."""
@@ -279,6 +341,12 @@ class Shield:
     def _remember(self, judgement: Judgement, decision: FilterDecision, observation: dict[str, Any]) -> None:
         self.overrides = self.overrides.after(decision.intervened.numpy(), judgement.retreats)
         self.beliefs.append(judgement.belief)  # in place of the one that it grew out of
+        self.foretold.append(judgement.foretold)
+        blind = np.isin(decision.reason.numpy(), UNSEEN)
+        in_sight = np.zeros(len(blind)) if self._in_sight is None else self._in_sight
+        self._in_sight = np.where(blind, 0, in_sight + 1)  # ticks
+        if self.monitor is not None:
+            self.monitor.end_tick()
         self.observed = {key: observation[key] for key in self.guard.inputs if key in observation}
         self._was_told(decision.action.numpy().copy())
         self._tell(decision)
@@ -382,9 +450,12 @@ class Shield:
                 if not (other._decided(observation, action) and self._accepts(other)):
                     continue
                 self.beliefs, self._told_at = other.beliefs.copy(), other._told_at.copy()
-                for name in ("observed", "decision", "overrides"):
+                self.foretold = other.foretold.copy()
+                for name in ("observed", "decision", "overrides", "_in_sight"):
                     setattr(self, name, getattr(other, name))
                 self.guard.adopt(other.guard)
+                if self.monitor is not None and other.monitor is not None:
+                    self.monitor.adopt(other.monitor)
                 return self.decision
         return None
 
@@ -408,13 +479,17 @@ class Shield:
             )
         return self._same_weights[other]
 
-    def _filter_history(self, percepts: Latent, state: np.ndarray, heard: Tensor, blind: Tensor) -> Belief:
-        """What the world model makes of the episode; of rows that are blind (B,) it goes on by imagination alone."""
-        world_model, units, executed = self.model.world_model, self.model.units, self.executed
-        shown = units.normalise_state(self.model.tensor(state)).nan_to_num(0.0)
+    def _what_led_here(self, heard: Tensor) -> Tensor:
+        """What was executed since the frame that the belief saw last (B, K A); before the first, as is heard (B, A)."""
+        executed = self.executed
         # Where so many ticks have not been, the belief is a fresh one, and only what counts as first is read of this.
         n_unknown = self.beliefs.maxlen - len(executed)
-        before = torch.cat([*[executed[0] if executed else heard] * n_unknown, *executed], 1)
+        return torch.cat([*[executed[0] if executed else heard] * n_unknown, *executed], 1)
+
+    def _filter_history(self, percepts: Latent, state: np.ndarray, before: Tensor, blind: Tensor) -> Belief:
+        """What the world model makes of the episode; of rows that are blind (B,) it goes on by imagination alone."""
+        world_model, units = self.model.world_model, self.model.units
+        shown = units.normalise_state(self.model.tensor(state)).nan_to_num(0.0)
         first = units.first_action(before)
 
         def observe(latent: Latent | None) -> Latent:
@@ -453,6 +528,15 @@ class Shield:
         # A target that does not move stays as it was told, so that an arm does not sink, and a grip does not open.
         sound = sound & ~(limits.stays | (limits.is_target & (on_host(action) == 0)))
         return np.where(sound, clipped, hold)
+
+
+def monitor_of(model: SafetyModel) -> UnknownMonitor | None:
+    """The monitor of the unknown that a filter was saved with, if any."""
+    trained_on, familiar = model.config.trained_on, model.familiar
+    if familiar is None:
+        return None
+    record = trained_on.monitor
+    return UnknownMonitor(familiar, record.cameras, record.alpha, record.rank, trained_on.fps)
 
 
 def _same(observation: dict[str, Any], other: dict[str, Any]) -> bool:

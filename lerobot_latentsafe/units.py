@@ -6,7 +6,7 @@ its displacement, the target minus the present state. So targets are converted w
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import torch
@@ -18,6 +18,32 @@ from lerobot_latentsafe.meanings import Command, parse
 STAGES = ("untrained", "guard", "world_model", "critic")
 LOUDEST = 4.0
 """Inside, a displacement of the 99th percentile is 1; the rare larger ones are heard as this at most."""
+
+
+@dataclass
+class Monitored:
+    """What the monitor of the unknown was fitted on; its numbers lie in a file beside the weights.
+
+    Attributes:
+        alpha: the chance of any alarm in a healthy episode.
+        episodes, rank: the threshold is the so-manieth of as many healthy episodes' strangest moments, ascending.
+        fitted_on: episodes that the rest was learned from.
+        cameras: those that it looks through, in order.
+        image_size: pixels a side of the pictures that it looked at.
+        dynamics: whether it also compares what was foretold with what came.
+        world_model: hash of the world model that foretold.
+        statistics: hash of the numbers.
+    """
+
+    alpha: float = 0.05
+    episodes: int = 0
+    rank: int = 0
+    fitted_on: int = 0
+    cameras: list[str] = field(default_factory=list)
+    image_size: int = 0
+    dynamics: bool = False
+    world_model: str = ""
+    statistics: str = ""
 
 
 @dataclass
@@ -46,6 +72,7 @@ class TrainedOn:
         unanswered: how far each command goes at most while the state stays as it is; see `looks.Response`.
         looks: camera key -> what its pictures have in common.
         episodes: fingerprints of the episodes trained on, 8 hex digits each; None: unknown. See `episode_marks`.
+        monitor: what the monitor of the unknown was fitted on; None: there is none.
     """
 
     stage: str = "untrained"
@@ -73,6 +100,7 @@ class TrainedOn:
     unanswered: list[float] | None = None
     looks: dict[str, Look] | None = None
     episodes: str | None = None
+    monitor: Monitored | None = None
 
     def __post_init__(self) -> None:
         if self.stage not in STAGES:

@@ -68,6 +68,7 @@ VERBS: dict[str, Verb] = {
         "label", _LABEL, "WriteLabels", "copy a dataset with its labels as columns, and push it on request"
     ),
     "guard": Verb("train", _GUARD, "Guard", "make a guard of recorded episodes, without labels or training"),
+    "monitor": Verb("train", _GUARD, "Monitor", "fit a monitor to a filter that says when the scene is unknown"),
     "cache": Verb("train", _TRAIN, "Cache", "decode a dataset's frames once, so that training does not have to"),
     "train-margin": Verb("train", _TRAIN, "TrainMargin", "fit the failure margin to labels on a frozen world model"),
     "train-reachability": Verb(

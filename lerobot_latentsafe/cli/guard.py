@@ -1,13 +1,14 @@
-"""The verb that makes a guard: what works on the first day, before anything is labelled or trained."""
+"""The verbs that make a guard, and a monitor of the unknown: what needs no training."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from lerobot_latentsafe.cli.options import DatasetSource
+from lerobot_latentsafe.cli.options import DatasetSource, OptionalDatasetSource, PolicySource
 from lerobot_latentsafe.guarding import new_guard, with_guard
 from lerobot_latentsafe.looks import ALTERATIONS
 from lerobot_latentsafe.modeling_latentsafe import load_filter
+from lerobot_latentsafe.monitoring import fit_monitor
 from lerobot_latentsafe.runtime.files import refuse_existing
 from lerobot_latentsafe.runtime.hub import save_policy
 from lerobot_latentsafe.units import TrainedOn
@@ -68,6 +69,48 @@ class Guard:
         print("\n".join(told(policy.config.trained_on)))
         kind = "a filter that knows its cameras" if self.policy.path else "a guard; it has no V, and foresees nothing"
         print(f"wrote {self.output_dir}: {kind}")
+
+
+@dataclass
+class Monitor:
+    """Fit a monitor that says when the scene is unknown, to a filter or a guard: it needs no training.
+
+    latentsafe monitor --policy.path=outputs/filter --dataset.root=data/held_out --output_dir=outputs/monitored \\
+      --reference.root=data/bag
+
+    Give healthy episodes with pictures that the filter was not trained on, driven as they will be; those with a frame
+    that is labelled as failing are left out. An alarm comes in --alpha of such episodes at most. That needs 19 for 5%,
+    and a few more to learn from. With --reference.root, what is familiar is learned of that recording, such as the one
+    that the filter was trained on, and fewer are enough.
+
+    A camera alarms that shows what the data do not; the dynamics alarm where what follows is not what the world model
+    foretold. What is done then is --policy.law.unknown: hold (the default), hand_over, slow, or warn.
+    """
+
+    policy: PolicySource
+    output_dir: Path
+    """The folder to write."""
+    dataset: DatasetSource = field(default_factory=DatasetSource)
+    reference: OptionalDatasetSource = field(default_factory=OptionalDatasetSource)
+    alpha: float = 0.05
+    """The chance of any alarm in a healthy episode."""
+
+    def run(self) -> None:
+        """Fit it, save the filter with it, and say what it promises."""
+        refuse_existing(self.output_dir)
+        policy = load_filter(self.policy.path)
+        meta, contract = self.dataset.contract()
+        reference = None
+        if self.reference.repo_id or self.reference.root:
+            known, all_of_it = self.reference.contract()
+            reference = known, all_of_it.only(self.reference.episodes)
+        fit_monitor(policy, meta, contract.only(self.dataset.episodes), self.alpha, reference)
+        save_policy(policy, self.output_dir)
+        record = policy.config.trained_on.monitor
+        print(
+            f"wrote {self.output_dir}: any alarm in {record.alpha:.3g} of healthy episodes at most, by the "
+            f"{record.rank}. of {record.episodes} episodes; {record.fitted_on} more were learned from"
+        )
 
 
 def told(trained_on: TrainedOn) -> Iterator[str]:

@@ -21,7 +21,8 @@ class Journal:
     """Rows of decisions by episode and frame, for a parquet file.
 
     Columns: episode_index, frame_index, proposed and executed (lists of float, robot units), value, margin, intervened,
-    reason (the name of a `Reason`). What was executed tells which dataset it belongs to. Frames count from 0 in each
+    reason (the name of a `Reason`); of a filter with a monitor of the unknown also unknown (share of its threshold) and
+    drift (the session's evidence E). What was executed tells which dataset it belongs to. Frames count from 0 in each
     episode; the pauses between episodes leave no rows.
 
     Raises:
@@ -58,6 +59,7 @@ class Journal:
                 "margin": decision.margin.item(),
                 "intervened": bool(decision.intervened.item()),
                 "reason": Reason(int(decision.reason.item())).name.lower(),
+                **_of_the_unknown(decision),
             }
         )
 
@@ -85,6 +87,12 @@ class Journal:
                 self.write_to(partial)
         except OSError as e:
             logger.error("decisions were not written to %s (%s); they are kept and tried again", self.path, e)
+
+
+def _of_the_unknown(decision: FilterDecision) -> dict[str, float]:
+    """What a monitor of the unknown found, if there is one."""
+    found = {"unknown": decision.unknown, "drift": decision.drift}
+    return {name: value.item() for name, value in found.items() if value is not None}
 
 
 def _read(path: Path) -> pa.Table:

@@ -14,11 +14,9 @@ from torch import Tensor
 
 from lerobot_latentsafe.datasets.clips import ClipReader
 from lerobot_latentsafe.decision import FilterDecision, Reason, first_of
-from lerobot_latentsafe.guard import UNSEEN, Guard, Seen, standing_still
-from lerobot_latentsafe.host import on_host
-from lerobot_latentsafe.latent import is_sound
+from lerobot_latentsafe.guard import Guard, Seen, standing_still
 from lerobot_latentsafe.safety_model import SafetyModel
-from lerobot_latentsafe.shield import Judgement, Shield
+from lerobot_latentsafe.shield import Shield
 
 TOGETHER = 64
 """Episodes that are judged side by side."""
@@ -63,14 +61,10 @@ class RecordedShield(Shield):
 
     def __init__(self, model: SafetyModel):
         super().__init__(model, clock=standing_still)
-        self.guard = RecordedGuard(model)
+        self.guard, self.monitor = RecordedGuard(model), None
 
-    def _imagine(self, seen: Seen, faults: np.ndarray, ahead: Tensor, hold: np.ndarray) -> tuple[Judgement, np.ndarray]:
-        unsound = ~is_sound(seen.images)
-        blind = self.model.tensor(np.isin(faults, UNSEEN)) | unsound
-        belief = self._filter_history(seen.images, seen.state, ahead[:, 0], blind)
-        faults = np.where(on_host(unsound, torch.bool) & (faults == Reason.PASSED), Reason.FILTER_FAILED, faults)
-        return Judgement(belief, *self._look_ahead(belief.latent, ahead, hold)), faults
+    def _perceive(self, seen: Seen) -> dict[str, Tensor]:
+        return seen.images  # percepts already
 
     def _tell(self, decision: FilterDecision) -> None:
         """Nothing: it acts on nobody."""

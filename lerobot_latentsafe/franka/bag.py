@@ -43,7 +43,10 @@ TAIL, MIDDLE, MOUTH = 0, 3, SEGMENTS - 1
 
 @dataclass(frozen=True)
 class Variant:
-    """Looks and mechanics of a bag: bending stiffness in N m/rad, mass in kg, radius in m."""
+    """Looks and mechanics of a bag: bending stiffness in N m/rad, mass in kg, radius in m.
+
+    Friction is that of film and candies; `beside` holds further MJCF elements of the scene.
+    """
 
     colour: str = "0.78 0.05 0.06"
     cloth: bool = False
@@ -51,6 +54,8 @@ class Variant:
     candy_mass: float = 0.002
     candy_radius: float = 0.0065
     sealed: bool = False
+    friction: float = 0.3
+    beside: str = ""
 
 
 VARIANTS: dict[str, Variant] = {
@@ -77,7 +82,7 @@ class BagScene(FrankaScene):
     """Lift the bag without spilling. Truth: spilled candies, spill fraction, success.
 
     Args:
-        variant: one of VARIANTS.
+        variant: one of VARIANTS, or another.
         n_candies: how many candies, 20 to 40.
         image_size: side of the camera images.
     """
@@ -87,11 +92,12 @@ class BagScene(FrankaScene):
     lift_height = 0.10
     """The bag counts as lifted when the held segment is this far above where it lay, m."""
 
-    def __init__(self, variant: str = "red", n_candies: int = 24, image_size: int = 224):
-        check_scene("bag", variant, image_size)
+    def __init__(self, variant: str | Variant = "red", n_candies: int = 24, image_size: int = 224):
+        check_scene("bag", variant if isinstance(variant, str) else None, image_size)
         if not 20 <= n_candies <= 40:
             raise ValueError(f"n_candies is {n_candies}; expected 20 to 40")
-        self.variant, self.n_candies = VARIANTS[variant], n_candies
+        self.variant = VARIANTS[variant] if isinstance(variant, str) else variant
+        self.n_candies = n_candies
         super().__init__(_scene(self.variant, n_candies), image_size)
         model = self.model
         self.segments = [
@@ -279,7 +285,8 @@ def _scene(variant: Variant, n_candies: int) -> str:
   tolerance="1e-8"/>
 <default>
   <default class="film">
-    <geom type="box" contype="4" conaffinity="2" group="3" friction="0.3 0.002 0.0001" solref="0.008 1"/>
+    <geom type="box" contype="4" conaffinity="2" group="3" friction="{variant.friction} 0.002 0.0001"
+      solref="0.008 1"/>
   </default>
   <default class="wall">
     <joint type="slide" range="0 {WIDTH / 2 - 0.005}" solreflimit="0.005 1" stiffness="15" damping="0.4"
@@ -292,7 +299,7 @@ def _scene(variant: Variant, n_candies: int) -> str:
   <default class="candy">
     <joint type="slide"/>
     <geom type="sphere" size="{variant.candy_radius}" mass="{variant.candy_mass}" contype="2" conaffinity="2" condim="3"
-      friction="0.3 0.002 0.0001" solref="0.01 1" group="2"/>
+      friction="{variant.friction} 0.002 0.0001" solref="0.01 1" group="2"/>
   </default>
 </default>
 <worldbody>
@@ -301,6 +308,7 @@ def _scene(variant: Variant, n_candies: int) -> str:
   <camera name="front" pos="1.16 0.45 0.44" xyaxes="-0.563 0.826 0 -0.307 -0.210 0.928" fovy="36"/>
   {_segment(0, variant)}
   {"".join(_candy(i) for i in range(n_candies))}
+  {variant.beside}
 </worldbody>
 <deformable>{_skin("film", variant.colour, 1.0)}{_skin("lining", "0.75 0.75 0.78", 0.97)}</deformable>
 <equality>{"".join(_grasp(k) for k in range(SEGMENTS))}</equality>"""

@@ -1,1 +1,1 @@
-"""How far what is promised of a filter holds."""
+"""What can be promised of a filter: how often it misses, and whether it says that the scene is new."""

@@ -34,7 +34,9 @@ class LatentSafeShielded(WrappedRobot):
     """To LeRobot it is the inner robot: same name, features, cameras. What is sent to it goes through the filter.
 
     Observations also hold `shield.value`, `shield.margin` (not a number before the first decision) and
-    `shield.intervened` of the last decision: recordings leave them out, `--display_data=true` shows them.
+    `shield.intervened` of the last decision: recordings leave them out, `--display_data=true` shows them. A filter with
+    a monitor of the unknown adds `shield.unknown` (share of its threshold, above 1 it alarms) and `shield.hand_over`
+    (1 where a person is asked to take over).
 
     Attributes:
         inner: the robot that moves.
@@ -161,10 +163,12 @@ class LatentSafeShielded(WrappedRobot):
 
     def _shown(self) -> dict[str, float]:
         """The last decision as numbers; there from the first tick on, for a display lays out what it sees first."""
-        decision = self._decision
+        decision, names = self._decision, ["value", "margin", "intervened"]
+        if self.filter.shield.monitor is not None:
+            names += ["unknown", "hand_over"]
         if decision is None:
-            return {"shield.value": math.nan, "shield.margin": math.nan, "shield.intervened": 0.0}
-        return {f"shield.{name}": float(getattr(decision, name).item()) for name in ("value", "margin", "intervened")}
+            return {f"shield.{name}": 0.0 if name in ("intervened", "hand_over") else math.nan for name in names}
+        return {f"shield.{name}": float(getattr(decision, name).item()) for name in names}
 
     # -- what is to be executed ---
 

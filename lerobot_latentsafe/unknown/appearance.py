@@ -1,0 +1,120 @@
+"""How strange a picture is, patch by patch, beside the pictures of a dataset: no training, no labels, no encoder.
+
+A picture is cut into GRID x GRID patches. A patch is 2 x 2 cells, each with its mean colour and how fine its detail is.
+For every patch of every camera a dataset shows a few kinds: table, arm, object. A patch is as strange as its distance
+from the nearest kind, in standard deviations of that kind (as PaDiM, Defard et al. 2021, with several Gaussians a patch
+instead of one: one that spans table and arm calls everything between them usual).
+
+The same was measured on tokens of a frozen encoder: these tell light and small cover worse, and cost more.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lerobot_latentsafe.host import on_host
+from lerobot_latentsafe.pictures import averaged
+
+GRID, CELLS = 6, 12
+"""Patches and cells a side."""
+FINEST = 96
+"""Pixels a side that are looked at, at most."""
+NUMBERS = 16
+"""Of a patch: four cells, each of three colours and a detail."""
+KINDS = 16
+"""Kinds of each patch."""
+LEAST = 0.02
+"""Least standard deviation of a number: five grey levels, as a live picture was never compressed to a video."""
+STRANGEST = 4
+"""Patches whose mean distance is the second score."""
+FRAMES = 6_000
+"""Frames that the kinds are learned from, at most."""
+ROUNDS = 8
+"""Of k-means."""
+PRIOR = 20
+"""Frames that the deviations of all kinds of a patch count for, beside those of the kind itself."""
+
+
+class Library(NamedTuple):
+    """The kinds of each patch: their means, and the inverse variances of their numbers, both (C, P, KINDS, NUMBERS)."""
+
+    mean: np.ndarray
+    precision: np.ndarray
+
+
+def views(images: dict[str, Tensor], keys: list[str]) -> np.ndarray:
+    """Pictures as patches.
+
+    Args:
+        images: camera key -> (B, 3, H, W) in [0, 1].
+        keys: of the C cameras, in order.
+
+    Returns:
+        (B, C, GRID^2, NUMBERS), on the host.
+    """
+    pictures = torch.stack([images[key] for key in keys], 1)
+    if max(pictures.shape[-2:]) > FINEST:
+        pictures = averaged(pictures, FINEST)
+    apart = (pictures[..., ::2, ::2] - pictures[..., 1::2, 1::2]).abs().mean(-3, keepdim=True)
+    detail = (averaged(apart, CELLS) + 1e-4).sqrt()
+    cells = on_host(torch.cat([averaged(pictures, CELLS), detail], -3))
+    n, c, of = cells.shape[:3]
+    apart_cells = cells.reshape(n, c, of, GRID, 2, GRID, 2)
+    return apart_cells.transpose(0, 1, 3, 5, 2, 4, 6).reshape(n, c, GRID**2, NUMBERS)
+
+
+def strangeness(seen: np.ndarray, library: Library) -> np.ndarray:
+    """Two scores of each camera: log of the mean distance of all patches, and of the STRANGEST.
+
+    Args:
+        seen: (B, C, P, NUMBERS), see `views`.
+
+    Returns:
+        (B, C, 2).
+    """
+    apart = seen[:, :, :, None] - library.mean
+    apart *= apart
+    apart *= library.precision
+    distance = np.sort(apart.mean(-1).min(-1), -1)  # (B, C, P)
+    return np.log(np.stack([distance.mean(-1), distance[..., -STRANGEST:].mean(-1)], -1) + 1e-6)
+
+
+def learn(seen: np.ndarray) -> Library:
+    """The kinds of each patch, by k-means from starts that lie far apart.
+
+    Args:
+        seen: (N, C, P, NUMBERS) of frames.
+    """
+    if len(seen) > FRAMES:
+        seen = seen[np.random.default_rng(0).choice(len(seen), FRAMES, replace=False)]
+    cameras = [_kinds(torch.from_numpy(np.ascontiguousarray(camera))) for camera in seen.transpose(1, 2, 0, 3)]
+    means, precisions = zip(*cameras)
+    return Library(np.stack(means), np.stack(precisions))
+
+
+def _kinds(x: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """Means and inverse variances (P, KINDS, NUMBERS) of the numbers (P, N, NUMBERS) of one camera's patches."""
+    patches = torch.arange(len(x))
+    centres = x[:, :1]
+    nearest = (x - centres).square().sum(-1)
+    for _ in range(KINDS - 1):
+        furthest = x[patches, nearest.argmax(1)][:, None]
+        centres = torch.cat([centres, furthest], 1)
+        nearest = torch.minimum(nearest, (x - furthest).square().sum(-1))
+    for _ in range(ROUNDS):
+        share, count = _shares(x, centres)
+        moved = torch.einsum("pnk,pnj->pkj", share, x) / count.clamp(min=1)[..., None]
+        centres = torch.where(count[..., None] > 0, moved, centres)
+    share, count = _shares(x, centres)
+    apart = (x - torch.einsum("pnk,pkj->pnj", share, centres)).square()
+    own = torch.einsum("pnk,pnj->pkj", share, apart) + PRIOR * apart.mean(1, keepdim=True)
+    variance = own / (count + PRIOR)[..., None] + LEAST**2
+    return centres.numpy(), (1 / variance).numpy()
+
+
+def _shares(x: Tensor, centres: Tensor) -> tuple[Tensor, Tensor]:
+    """Which centre is nearest, one-hot (P, N, KINDS), and of how many frames each is (P, KINDS)."""
+    share = torch.nn.functional.one_hot(torch.cdist(x, centres).argmin(-1), centres.shape[1]).float()
+    return share, share.sum(1)
