@@ -54,7 +54,7 @@ predicted next latent stays above epsilon, and otherwise acts itself to preserve
 outside of what its data covered."""
 
 FILTER_LIMITS = """\
-- V means nothing outside of what the data covered: other cameras, objects, dynamics, lighting. Nothing detects that.
+- V means nothing outside of what the data covered: other cameras, objects, dynamics, lighting. {unknown}
 - It acts at the last moment and with the fallback's full action; it looks for no safe action near the proposed one.
 - {imagination}"""
 
@@ -163,7 +163,11 @@ def make_model_card(
         outdated: why its calibration is another filter's, if it is; see `calibration.differences`.
     """
     guards = config.law.name == "guard"
-    limits = GUARD_LIMITS if guards else FILTER_LIMITS.format(imagination=_imagination(config.law.samples))
+    limits = (
+        GUARD_LIMITS
+        if guards
+        else FILTER_LIMITS.format(unknown=_unknown(config), imagination=_imagination(config.law.samples))
+    )
     rows = {
         "trained on": _code(dataset_repo_id),
         **_robot(config),
@@ -180,6 +184,19 @@ def make_model_card(
             evaluation=_evaluation(config.evaluation),
             limits=limits,
         )
+    )
+
+
+def _unknown(config: LatentSafeConfig) -> str:
+    """Whether anything says that the scene is new, and what is done then."""
+    monitor = config.trained_on.monitor
+    if monitor is None:
+        return "Nothing detects that: `latentsafe monitor` adds a monitor."
+    watched = "what cameras show" + (", and what follows from actions," if monitor.dynamics else "")
+    return (
+        f"Its monitor watches {watched} and alarms in at most {monitor.alpha:.1%} of healthy episodes (number "
+        f"{monitor.rank} of {monitor.episodes} held out). Then the law says `{config.law.unknown}`. It may not tell what "
+        "looks alike and is stiffer, heavier or more slippery."
     )
 
 

@@ -206,6 +206,15 @@ def no_looks(policy):
     return policy
 
 
+def test_the_card_says_whether_anything_tells_that_the_scene_is_new(monitored, tiny_filter):
+    without = load_filter(tiny_filter).generate_model_card("me/car", "latentsafe", None, None).text
+    text = monitored.generate_model_card("me/car", "latentsafe", None, None).text
+    assert "Nothing detects that: `latentsafe monitor` adds" in without and "Nothing detects" not in text
+    record = monitored.config.trained_on.monitor
+    assert f"alarms in at most {record.alpha:.1%} of healthy episodes (number {record.rank} of" in text
+    assert "the law says `hold`" in text
+
+
 def test_a_healthy_episode_passes_with_its_share_of_the_threshold(monitored):
     _, decisions = driven(monitored)
     assert all(d.reason == Reason.PASSED and not d.hand_over and d.unknown <= 1 for d in decisions)
