@@ -195,8 +195,8 @@ def _unknown(config: LatentSafeConfig) -> str:
     watched = "what cameras show" + (", and what follows from actions," if monitor.dynamics else "")
     return (
         f"Its monitor watches {watched} and alarms in at most {monitor.alpha:.1%} of healthy episodes (number "
-        f"{monitor.rank} of {monitor.episodes} held out). Then the law says `{config.law.unknown}`. It may not tell what "
-        "looks alike and is stiffer, heavier or more slippery."
+        f"{monitor.rank} of {monitor.episodes} held out). Then the law says `{config.law.unknown}`. It may not tell "
+        "what looks alike and is stiffer, heavier or more slippery."
     )
 
 
