@@ -41,6 +41,9 @@ class Imagination(Protocol):
     def margin(self, latent: Latent) -> Tensor:
         """Bounded margin l(z): (B,)."""
 
+    def judged(self, latent: Latent) -> tuple[Tensor, Tensor]:
+        """Features (B, D) and bounded margin (B,), both at once."""
+
     def ended(self, latent: Latent) -> Tensor:
         """Whether the episode is over in this latent: bool (B,). Nothing can fail after that."""
 
@@ -65,29 +68,26 @@ def look_ahead(
     Returns:
         V (N,), and the first action of the best policy (N, A).
     """
+    features, margin = imagination.judged(latent)
     if horizon == 0 and critic is not None:
-        features = imagination.features(latent)
-        action = imagination.complete(latent, critic.fallback(features))
-        return critic.value(features, imagination.margin(latent)), action
-    now = imagination.margin(latent)
-    n, n_policies = len(now), len(held) + (critic is not None)
+        return critic.value(features, margin), imagination.complete(latent, critic.fallback(features))
+    n, n_policies = len(margin), len(held) + (critic is not None)
     z = map_latent(latent, lambda t: t.repeat(n_policies, *[1] * (t.dim() - 1)))
-    worst, over = now.repeat(n_policies), torch.zeros(n * n_policies, dtype=torch.bool, device=now.device)
+    worst, over = margin.repeat(n_policies), torch.zeros(n * n_policies, dtype=torch.bool, device=margin.device)
     action = first = held.repeat_interleave(n, 0)
     for t in range(horizon):
-        if critic is not None:
-            follower = map_latent(z, lambda x: x[len(held) * n :])
-            action = torch.cat([action[: len(held) * n], critic.fallback(imagination.features(follower))])
+        if critic is not None:  # the last n follow its fallback policy
+            action = torch.cat([action[: len(held) * n], critic.fallback(features[-n:])])
         action = imagination.complete(z, action)
         first = action if t == 0 else first
         z = imagination.step(z, action)
-        worst = torch.where(over, worst, torch.minimum(worst, imagination.margin(z)))
+        features, margin = imagination.judged(z)
+        worst = torch.where(over, worst, torch.minimum(worst, margin))
         over = over | imagination.ended(z)
     if critic is not None:
-        after = critic.value(imagination.features(z), imagination.margin(z))
-        worst = torch.where(over, worst, torch.minimum(worst, after))
+        worst = torch.where(over, worst, torch.minimum(worst, critic.value(features, margin)))
     best = worst.view(n_policies, n).max(0)
-    return best.values, first.view(n_policies, n, -1)[best.indices, torch.arange(n, device=now.device)]
+    return best.values, first.view(n_policies, n, -1)[best.indices, torch.arange(n, device=worst.device)]
 
 
 def discount(progress: float, config: ReachabilityConfig) -> float:

@@ -61,7 +61,12 @@ class LatentImagination:
 
     def margin(self, latent: Latent) -> Tensor:
         """Bounded margin l(z): (B,)."""
-        return self.failure_margin.bounded(self.world_model.features(latent))
+        return self.judged(latent)[1]
+
+    def judged(self, latent: Latent) -> tuple[Tensor, Tensor]:
+        """Features (B, D) and bounded margin (B,), both at once."""
+        features = self.world_model.features(latent)
+        return features, self.failure_margin.bounded(features)
 
     def complete(self, latent: Latent, action: Tensor) -> Tensor:
         """The action (B, A) with the frozen commands as they were before this latent."""

@@ -497,6 +497,8 @@ class Shield:
             if latent is not None:  # what went wrong once must not poison the rest of an episode
                 lost = ~is_sound(latent)
                 new, led = replace_rows(latent, new, where=lost), torch.where(lost[:, None], first, before)
+            if not blind.any():
+                return world_model.observe(new, led, percepts, shown)
             predicted = world_model.step(new, led)
             return replace_rows(world_model.correct(predicted, percepts, shown), predicted, where=blind)
 

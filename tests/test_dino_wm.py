@@ -297,6 +297,21 @@ def test_streaming_with_a_frame_token_equals_the_full_forward(options):
     assert model.features(latent).shape == (3, model.feature_dim) and model.percept_names == ["tokens", "vector"]
 
 
+@pytest.mark.parametrize("options", [{"depth": 1}, {"depth": 3}, {"memory": 0}, {"conditioning": "concat"}])
+@torch.no_grad()
+def test_what_is_seen_takes_no_prediction(options):
+    """Observing is predicting and correcting, though it skips what would be corrected."""
+    model, clip = build_merged(**options).eval(), merged_clip()
+    latent = model.initial(3)
+    for t in range(8):
+        percepts = {name: values[:, t] for name, values in clip.percepts.items()}
+        whole = model.correct(model.step(latent, clip.action[:, t]), percepts, clip.state[:, t])
+        latent = model.observe(latent, clip.action[:, t], percepts, clip.state[:, t])
+        assert latent.keys() == whole.keys()
+        for name, value in whole.items():
+            torch.testing.assert_close(latent[name], value, atol=1e-5, rtol=0)
+
+
 def test_every_parameter_of_the_recipe_learns():
     for options in ({}, {"memory": 0}, {"conditioning": "concat"}):
         model = build_merged(**options).train()

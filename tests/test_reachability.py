@@ -37,6 +37,9 @@ class WindyChain:
     def margin(self, latent):
         return latent["x"].squeeze(-1)
 
+    def judged(self, latent):
+        return self.features(latent), self.margin(latent)
+
     def ended(self, latent):
         return torch.zeros(len(latent["x"]), dtype=torch.bool)
 

@@ -162,6 +162,6 @@ class WorldModel(nn.Module, abc.ABC):
         for t in range(clip.state.shape[1]):
             latent = replace_rows(latent, fresh, where=clip.is_first[:, t])
             percepts = {key: value[:, t] for key, value in clip.percepts.items()}
-            latent = self.correct(self.step(latent, clip.action[:, t]), percepts, clip.state[:, t])
+            latent = self.observe(latent, clip.action[:, t], percepts, clip.state[:, t])
             latents.append(latent)
         return {key: torch.stack([z[key] for z in latents], 1) for key in latents[0]}

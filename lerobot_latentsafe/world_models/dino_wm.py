@@ -301,9 +301,26 @@ class DinoWM(TerminationHead):
         With a memory a latent may lack tokens and past: then what follows does, too.
         """
         past = [latent[name] for name in self.past_names if name in latent]
-        now = {name: latent[name][:, None] for name in self.seen_names if name in latent}
-        ahead = self._advance(now, action[:, None], latent["seen"][:, None], past, latent["context"])
+        ahead = self._advance(self._now(latent), action[:, None], latent["seen"][:, None], past, latent["context"])
         return self._next_latent(ahead, 0, latent["seen"], action)
+
+    def observe(
+        self, latent: Latent | None, action: Tensor | None, percepts: dict[str, Tensor], state: Tensor
+    ) -> Latent:
+        """See the base class. With a memory it takes no prediction, as that gives way to what is seen."""
+        if not self.memory_dim or latent is None or action is None:
+            return super().observe(latent, action, percepts, state)
+        now, told, seen = self._now(latent), [latent["state"][:, None], action[:, None]], latent["seen"][:, None]
+        told += self._remembered(now, action[:, None], seen, latent["context"])
+        past = [latent[name] for name in self.past_names]
+        x, condition = self._embed(*self._told_to_patches(now, told))
+        kept = self.transformer.keep(x, seen, past, condition)
+        ahead = _Ahead({"context": told[-1] * (seen > 0)[..., None]}, kept)
+        return self.correct(self._next_latent(ahead, 0, latent["seen"], action), percepts, state)
+
+    def _now(self, latent: Latent) -> dict[str, Tensor]:
+        """The frame of a latent, as one of a sequence: (B, 1, ...)."""
+        return {name: latent[name][:, None] for name in self.seen_names if name in latent}
 
     def correct(self, predicted: Latent, percepts: dict[str, Tensor], state: Tensor) -> Latent:
         """What was seen in place of what was predicted."""

@@ -54,17 +54,34 @@ class FrameTransformer(nn.Module):
         Returns:
             (B, T, P, d), and for each layer the keys and values of all H - 1 + T frames, (B, H - 1 + T, P, 2 K).
         """
+        past = self.empty_past(len(x), x.shape[2]) if past is None else past
+        x, kept, visible, rotation = self._but_the_last(x, seen, past, condition)
+        x, frames = self.blocks[-1](x, past[-1], visible, rotation, condition)
+        return self.norm(x), [*kept, frames]
+
+    def keep(
+        self, x: Tensor, seen: Tensor, past: list[Tensor] | None = None, condition: Tensor | None = None
+    ) -> list[Tensor]:
+        """The keys and values alone that `forward` returns, which takes no more than a part of the last layer."""
+        past = self.empty_past(len(x), x.shape[2]) if past is None else past
+        x, kept, _, _ = self._but_the_last(x, seen, past, condition)
+        last: _Block = self.blocks[-1]
+        return [*kept, last.keep(x, past[-1], condition)]
+
+    def _but_the_last(
+        self, x: Tensor, seen: Tensor, past: list[Tensor], condition: Tensor | None
+    ) -> tuple[Tensor, list[Tensor], Tensor, Tensor]:
+        """All layers but one: tokens, keys and values; and what each frame may see, and rotations by age."""
         batch, length, n_patches, _ = x.shape
-        past = self.empty_past(batch, n_patches) if past is None else past
         age = torch.arange(self.history - 1, -1, -1, device=x.device)
         visible = (age < seen[..., None]) | (age == 0)
         visible = visible.repeat_interleave(n_patches, -1).view(batch * length, 1, 1, -1)
         rotation = torch.polar(torch.ones_like(self.angle), self.angle)
         kept = []
-        for block, before in zip(self.blocks, past):
+        for block, before in zip(self.blocks[:-1], past):
             x, frames = block(x, before, visible, rotation, condition)
             kept.append(frames)
-        return self.norm(x), kept
+        return x, kept, visible, rotation
 
     def empty_past(self, batch_size: int, n_patches: int) -> list[Tensor]:
         """Keys and values before the first frame, which nothing may look at."""
@@ -102,6 +119,14 @@ class _Block(nn.Module):
         x = torch.addcmul(x, attended, gate)
         y = torch.addcmul(mlp_shift, self.mlp_norm(x), 1 + mlp_scale)
         return torch.addcmul(x, self.mlp(y), mlp_gate), kept
+
+    def keep(self, x: Tensor, past: Tensor, condition: Tensor | None) -> Tensor:
+        """The keys and values alone that `forward` returns."""
+        y = self.attention_norm(x)
+        if self.modulation is not None:
+            shift, scale = self.modulation(condition).unsqueeze(-2).chunk(6, -1)[:2]
+            y = torch.addcmul(shift, y, 1 + scale)
+        return torch.cat([past, F.linear(y, self.qkv.weight[self.inner :])], 1)
 
     def _attend(self, x: Tensor, past: Tensor, visible: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor]:
         """Each of T frames attends to the window of H frames that ends with it; also returns keys and values."""

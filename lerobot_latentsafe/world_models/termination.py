@@ -22,8 +22,11 @@ class TerminationHead(WorldModel):
 
     def ended(self, latent: Latent) -> Tensor:
         """Whether the head says that the episode is over: bool (...,)."""
+        # A head that never saw an end knows nothing. A GPU is not asked beforehand: that would wait for it.
+        if self.ends_seen.device.type == "cpu" and not self.ends_seen:
+            return torch.zeros(latent["action"].shape[:-1], dtype=torch.bool)
         over = self.continues(self.features(latent)).squeeze(-1) < 0
-        return over & (self.ends_seen > 0)  # a head that never saw an end knows nothing
+        return over & (self.ends_seen > 0)
 
     def end_loss(self, features: Tensor, clip: Clip) -> Tensor:
         """Cross-entropy of the head, which teaches the features nothing."""

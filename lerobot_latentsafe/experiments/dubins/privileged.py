@@ -42,6 +42,10 @@ class DubinsImagination:
         """l(s) in m^2: (B,)."""
         return latent["state"][..., :2].square().sum(-1) - car.RADIUS**2
 
+    def judged(self, latent: Latent) -> tuple[Tensor, Tensor]:
+        """Features (B, 4) and margin (B,)."""
+        return self.features(latent), self.margin(latent)
+
     def ended(self, latent: Latent) -> Tensor:
         """Whether the car has left the view: bool (B,)."""
         return latent["state"][..., :2].abs().amax(-1) > self.half_width
