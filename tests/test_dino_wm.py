@@ -336,18 +336,6 @@ def test_a_part_of_the_clips_teaches_the_patches_and_all_teach_the_frame():
     assert not some[2:, :, :n].any() and all_of_them[2:, :, :n].any()
 
 
-def test_patches_teach_the_memory_nothing():
-    """What they are told comes from the memory and the frame token, and these are as they would be without patches."""
-    model, clip = build_merged().train(), merged_clip()
-    frames = {**model._looked_at(clip.percepts), "state": clip.state}
-    ahead = model._advance(frames, clip.action, model._frames_seen(clip.is_first)).frames
-    ahead["tokens"].square().sum().backward()
-    assert not any(
-        p.grad is not None for part in (model.memory, model.memory_in, model.frame_decoder) for p in part.parameters()
-    )
-    assert model.frame_in.weight.grad.any() and model.condition_in[0].weight.grad.any()
-
-
 def test_without_a_memory_all_clips_show_their_patches():
     for options in ({"memory": 0}, {"frame_token": False}):
         model = build_merged(token_share=0.1, **options).eval()

@@ -400,7 +400,7 @@ class DinoWM(TerminationHead):
         told = [state, action, *self._remembered(frames, action, seen, context)]
         ahead, kept, frame = {}, [], []
         if "tokens" in frames:
-            x, condition = self._embed(*self._told_to_patches(frames, told))
+            x, condition = self._embed(frames, told)
             x, kept = self.transformer(x, seen, past or None, condition)
             patches = x[..., : frames["tokens"].shape[-2], :]
             ahead["tokens"] = frames["tokens"] + torch.cat([decoder(patches) for decoder in self.decoders], -1)
@@ -427,13 +427,6 @@ class DinoWM(TerminationHead):
             memory = self.memory(told[:, t], memory * (seen[:, t] > 1)[:, None])  # a first frame remembers nothing
             rows.append(memory)
         return [torch.stack(rows, 1)]
-
-    def _told_to_patches(self, frames: dict[str, Tensor], told: list[Tensor]) -> tuple[dict[str, Tensor], list[Tensor]]:
-        """Frames, and what patches are told beside. With a memory they listen to it and to the frame token, and teach
-        them nothing: else these foretell the far future worse."""
-        if not self.memory_dim:
-            return frames, told
-        return {**frames, "vector": frames["vector"].detach()}, [part.detach() for part in told]
 
     def _embed(self, frames: dict[str, Tensor], told: list[Tensor]) -> tuple[Tensor, Tensor | None]:
         """The transformer's input (B, T, P, d), and with AdaLN the condition (B, T, d) of its layers.
