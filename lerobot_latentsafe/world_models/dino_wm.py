@@ -313,7 +313,7 @@ class DinoWM(TerminationHead):
         now, told, seen = self._now(latent), [latent["state"][:, None], action[:, None]], latent["seen"][:, None]
         told += self._remembered(now, action[:, None], seen, latent["context"])
         past = [latent[name] for name in self.past_names]
-        x, condition = self._embed(*self._told_to_patches(now, told))
+        x, condition = self._embed(now, told)
         kept = self.transformer.keep(x, seen, past, condition)
         ahead = _Ahead({"context": told[-1] * (seen > 0)[..., None]}, kept)
         return self.correct(self._next_latent(ahead, 0, latent["seen"], action), percepts, state)
