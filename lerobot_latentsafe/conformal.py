@@ -11,7 +11,6 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-from scipy.stats import beta, binom
 
 CONFIDENCE = 0.95
 """Of bounds on shares, one-sided."""
@@ -31,6 +30,8 @@ def needed(alpha: float) -> int:
 
 def at_most(m: int, n: int) -> float:
     """Of m in n, the upper one-sided 95% bound of the share (Clopper and Pearson)."""
+    from scipy.stats import beta  # heavy, and the package imports this module
+
     return 1.0 if m >= n else float(beta.ppf(CONFIDENCE, m + 1, n - m))
 
 
@@ -82,6 +83,8 @@ def fixed_sequence(runs: Iterable[tuple[float, int, int]], alpha: float) -> dict
     Returns:
         alpha; epsilon, None if already the first was not rejected; and tests, each with epsilon, failures, n, p_value.
     """
+    from scipy.stats import binom
+
     tests, epsilon = [], None
     for tried, failures, n in runs:
         p_value = float(binom.cdf(failures, n, alpha))
