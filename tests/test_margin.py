@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from lerobot_latentsafe.margin import FailureMargin, hinge_loss
+from lerobot_latentsafe.margin import FailureMargin, MarginConfig, hinge_loss
 
 
 def test_hinge_loss_by_hand():
@@ -78,3 +78,9 @@ def test_fitted_margin_separates_and_tanh_still_resolves_it():
         l = margin(features)
     assert ((l < 0) == (failure == 1)).float().mean() > 0.95
     assert l.abs().median().item() == pytest.approx(1.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("noise", [-0.1, float("inf"), float("nan")])
+def test_noise_that_is_none_is_refused(noise):
+    with pytest.raises(ValueError, match="--policy.margin.noise is .*standard deviations, 0 or more"):
+        MarginConfig(noise=noise)
