@@ -82,5 +82,5 @@ def test_fitted_margin_separates_and_tanh_still_resolves_it():
 
 @pytest.mark.parametrize("noise", [-0.1, float("inf"), float("nan")])
 def test_noise_that_is_none_is_refused(noise):
-    with pytest.raises(ValueError, match="--policy.margin.noise is .*standard deviations, 0 or more"):
+    with pytest.raises(ValueError, match=r"--policy.margin.noise is .*standard deviations, 0 or more"):
         MarginConfig(noise=noise)
