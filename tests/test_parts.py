@@ -27,8 +27,17 @@ class Killed(BaseException):
     pass
 
 
+ALONE = threading.RLock()
+"""Threads stand in for processes here, and imports that fail, as LeRobot's of torchcodec may, are theirs in common."""
+
+
 def write(episodes, folder, recorded=None):
     """Episode i has i % 3 + 2 frames that hold its number."""
+    with ALONE:
+        _write(episodes, folder, recorded)
+
+
+def _write(episodes, folder, recorded):
     dataset = LeRobotDataset.create(REPO_ID, 10, FEATURES, root=folder, use_videos=False)
     for i in episodes:
         for t in range(i % 3 + 2):
