@@ -26,7 +26,7 @@ class Monitored:
 
     Attributes:
         alpha: the chance of any alarm in a healthy episode.
-        episodes, rank: the threshold is the so-manieth of as many healthy episodes' strangest moments, ascending.
+        episodes, rank: of so many healthy episodes, sorted by their strangest moments, number `rank` is the threshold.
         fitted_on: episodes that the rest was learned from.
         cameras: those that it looks through, in order.
         image_size: pixels a side of the pictures that it looked at.

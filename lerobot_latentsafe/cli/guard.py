@@ -108,8 +108,8 @@ class Monitor:
         save_policy(policy, self.output_dir)
         record = policy.config.trained_on.monitor
         print(
-            f"wrote {self.output_dir}: any alarm in {record.alpha:.3g} of healthy episodes at most, by the "
-            f"{record.rank}. of {record.episodes} episodes; {record.fitted_on} more were learned from"
+            f"wrote {self.output_dir}: any alarm in {record.alpha:.3g} of healthy episodes at most, by "
+            f"number {record.rank} of {record.episodes} episodes; {record.fitted_on} more were learned from"
         )
 
 

@@ -68,7 +68,7 @@ class DinoWMConfig(WorldModelConfig):
         memory: width of the recurrent memory that a frame token has; 0: none, what was before is in keys and values
             alone.
         token_share: share of a batch's clips whose patches are predicted. The others teach the memory and the frame
-            token, and the margin what these tell by themselves; they cost a tenth.
+            token, and the margin what these tell by themselves, and cost less.
         token_weight, frame_weight: of the errors of patches, and of the frame token.
         blind: see no images, only proprioception: the control that a model which looks must beat.
     """
@@ -362,8 +362,8 @@ class DinoWM(TerminationHead):
         return (latent["tokens"] - self._merged(percepts["tokens"])).square().mean((-2, -1))
 
     def _looked_at(self, percepts: dict[str, Tensor]) -> dict[str, Tensor]:
-        """What is seen of frames: tokens (..., P, C), and vector (..., F) with a frame token."""
-        seen = {"tokens": self._merged(percepts["tokens"])}
+        """What is seen of frames: tokens (..., P, C), if there are any, and vector (..., F) with a frame token."""
+        seen = {"tokens": self._merged(percepts["tokens"])} if "tokens" in percepts else {}
         if self._frame_percepts:
             seen["vector"] = torch.cat([percepts[name] for name in self._frame_percepts], -1)
         return {name: torch.zeros_like(value) for name, value in seen.items()} if self.config.blind else seen
@@ -463,9 +463,9 @@ class DinoWM(TerminationHead):
         n_clips, length = clip.state.shape[:2]
         last = self._last_observed(clip) if self.config.open_loop > 0 else length - 2
         shown = math.ceil(self._token_share * n_clips)
-        parts = [(slice(0, shown), self.seen_names), (slice(shown, n_clips), self.seen_names[1:])][
-            : 1 + (shown < n_clips)
-        ]
+        parts = [(slice(0, shown), self.seen_names)]
+        if shown < n_clips:
+            parts.append((slice(shown, n_clips), [name for name in self.seen_names if name != "tokens"]))
         done = [self._part_loss(clip.rows(part), names, last) for part, names in parts]
         loss = sum(
             ((part.stop - part.start) / n_clips * error for (part, _), (error, _, _) in zip(parts, done)),
@@ -481,8 +481,8 @@ class DinoWM(TerminationHead):
 
     def _part_loss(self, clip: Clip, names: list[str], last: int) -> tuple[Tensor, Tensor, dict[str, float]]:
         """Loss, features and metrics of clips of which `names` are predicted, and which are seen up to frame `last`."""
-        looked = {**self._looked_at(clip.percepts), "state": clip.state}
-        frames = {name: looked[name] for name in names}
+        percepts = {name: values for name, values in clip.percepts.items() if name != "tokens" or name in names}
+        frames = {**self._looked_at(percepts), "state": clip.state}
         seen, length = self._frames_seen(clip.is_first), clip.state.shape[1]
         goes_on = clip.valid[:, 1:] & clip.valid[:, :-1] & ~clip.is_first[:, 1:]
         known = slice(0, last + 1)
