@@ -19,3 +19,7 @@ done
 # Interrupted where the committed filter would act.
 [ -e "$OUT/bag_shielded" ] || .venv/bin/latentsafe collect --source=bag_shielded --dataset.repo_id=latentsafe/bag_shielded \
   --dataset.root="$OUT/bag_shielded" --seed=29 --dataset.num_episodes=100
+[ -e "$OUT/bag_varied" ] || .venv/bin/latentsafe collect --source=bag_varied --dataset.repo_id=latentsafe/bag_varied \
+  --dataset.root="$OUT/bag_varied" --seed=35
+[ -e "$OUT/bag_varied_pulls" ] || .venv/bin/latentsafe collect --source=bag_varied_pulls \
+  --dataset.repo_id=latentsafe/bag_varied_pulls --dataset.root="$OUT/bag_varied_pulls" --seed=37

@@ -68,6 +68,8 @@ record bag_policies bag_policies 23 120
 record bag_lifts_more bag_lifts 22 80
 record bag_pulls bag_pulls 25 100
 record bag_retreats bag_retreats 31 80
+record bag_varied bag_varied 35
+record bag_varied_pulls bag_varied_pulls 37
 record bag_shielded bag_shielded 29 100 # interrupted where the committed bag would act; when these were made, that of 6cf0280
 record bag_shielded_more bag_shielded 33 60
 record bag_strong bag_strong 0

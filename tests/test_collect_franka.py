@@ -13,6 +13,7 @@ from lerobot_latentsafe.collection.franka import collect_franka as collect
 from lerobot_latentsafe.collection.interventions import BRIEF, RETREATING, Interventions
 from lerobot_latentsafe.datasets.labels import FailureLabels
 from lerobot_latentsafe.franka.actions import action_limits
+from lerobot_latentsafe.franka.bag import VARIANTS, Variant
 from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
 from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
 
@@ -91,9 +92,23 @@ def test_branches_share_their_grasp_and_differ_after_it():
     assert np.abs(state(0, 0) - state(5, 0)).max() > 0.01
 
 
-def test_what_the_operator_of_a_pushed_hand_wants_is_recorded(tiny):
-    from dataclasses import replace
+@pytest.mark.parametrize("source", [name for name, source in SOURCES.items() if source.varied])
+def test_starts_of_varied_bags_have_bags_of_their_own(source):
+    """Branches share theirs, it is not one of the bags that filters are tested on, and it depends on the seed alone."""
+    bags = {}
+    with LatentSafeFrankaMujoco(LatentSafeFrankaMujocoConfig(image_size=32)) as robot:
+        for episode in (0, 1, 2, 0):
+            next(franka.episode_frames(robot, SOURCES[source], episode, 3))
+            bag = robot.scene.variant
+            assert bags.setdefault(episode, bag) == bag
+    assert bags[0] != bags[2] and (bags[0] == bags[1]) == (SOURCES[source].branches > 1)
+    for bag in bags.values():
+        looks = replace(bag, stiffness=Variant.stiffness, candy_mass=Variant.candy_mass, friction=Variant.friction)
+        assert looks == Variant()
+        assert bag.stiffness < VARIANTS["stiff"].stiffness and bag.candy_mass < VARIANTS["heavy"].candy_mass
 
+
+def test_what_the_operator_of_a_pushed_hand_wants_is_recorded(tiny):
     from lerobot_latentsafe.franka.actions import action_limits
 
     low, high = action_limits(20)

@@ -44,6 +44,7 @@ class Collect:
     - bag_shielded: the same policies, interrupted by a slow way down where the committed filter would override them
     - bag_retreats: whole lifts by either end and the middle, lowered slowly or stopped now and then
     - bag_pulls: the same lifts, undisturbed
+    - bag_varied, bag_varied_pulls: lifts of bags that are stiffer or softer, heavier or lighter, rougher or smoother
     - bag_middle, bag_strong, bag_weak: demonstrations; in the last two the hand is pushed aside now and then
     - blocks_demos, blocks_random: the blocks
 

@@ -19,7 +19,7 @@ from lerobot_latentsafe.collection.policy_operator import PolicyOperator
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE
 from lerobot_latentsafe.evaluation.rollouts import Choice, Step, steps
 from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES, action_limits, read_action
-from lerobot_latentsafe.franka.bag import BagScene
+from lerobot_latentsafe.franka.bag import BagScene, varied
 from lerobot_latentsafe.franka.behaviors import GRASPED, grasp, stray
 from lerobot_latentsafe.franka.scenes import CLUMSINESS, HELD_ANYWHERE, SCENES
 from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
@@ -39,6 +39,7 @@ class Source:
     Attributes:
         mix: behaviours of `franka/behaviors.py` with the number of episodes of each, in a dataset of full size;
             smaller ones keep the proportions. Episodes of different behaviours are interleaved.
+        varied: each start has a bag of its own stiffness, weight and friction.
         branches: episodes that start from each grasped state; 0 records whole episodes from the start.
         grasps: of those states, the shares in which the bag is held by each of its segments, from its closed end on.
         clumsiness: of those grasps: 1 is off by a few millimetres.
@@ -56,6 +57,7 @@ class Source:
     scene: str
     mix: dict[str, int]
     variant: str | None = None
+    varied: bool = False
     branches: int = 0
     grasps: tuple[float, ...] = (0.6, 0, 0, 0.2, 0, 0, 0.2)
     clumsiness: float = 1.0
@@ -97,6 +99,12 @@ SOURCES: dict[str, Source] = {
         "bag", {"open_end": 80, "middle": 30, "closed_end": 90}, astray=0.3, style=RETREATING, seconds=8.0
     ),
     "bag_pulls": Source("bag", {"open_end": 80, "middle": 30, "closed_end": 50, "side_to_side": 40}, astray=0.3),
+    "bag_varied": Source(
+        "bag", {"branch": 80, "climb": 80, "rise": 80}, varied=True, branches=2, grasps=(0.5, 0, 0, 0.1, 0, 0, 0.4)
+    ),
+    "bag_varied_pulls": Source(
+        "bag", {"open_end": 30, "middle": 15, "closed_end": 65, "side_to_side": 10}, varied=True, astray=0.3
+    ),
     "bag_middle": Source("bag", {"middle": 100}, astray=0.8),
     "bag_strong": Source("bag", {"middle": 240}, astray=0.8, pushed=0.1),
     "bag_weak": Source("bag", {"closed_end": 240}, variant="sealed", astray=0.8, pushed=0.1),
@@ -199,6 +207,8 @@ def episode_truths(robot: LatentSafeFrankaMujoco, source: Source, episode: int, 
 
 def _begin(robot: LatentSafeFrankaMujoco, source: Source, episode: int, scene_seed: int) -> np.ndarray:
     """Bring the robot where the episode starts. Returns the pushes (T, 7) of the T steps that it has."""
+    if source.varied:
+        robot.change_scene(BagScene(varied(np.random.default_rng([10, scene_seed])), image_size=robot.image_size))
     robot.reset(scene_seed)
     info, scene = SCENES[source.scene], robot.scene
     n_frames = round((source.seconds or info.episode_seconds) * info.fps)

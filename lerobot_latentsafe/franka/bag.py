@@ -69,6 +69,15 @@ VARIANTS: dict[str, Variant] = {
 }
 
 
+def varied(rng: np.random.Generator) -> Variant:
+    """A bag that looks like the red one, and is stiffer or softer, heavier or lighter, rougher or smoother.
+
+    The ranges leave out `stiff`, `heavy` and bags beyond them, on which filters are tested.
+    """
+    stiffness, candy_mass, friction = np.exp(rng.uniform(*np.log([(0.012, 0.0012, 0.12), (0.08, 0.0035, 0.5)])))
+    return Variant(stiffness=stiffness, candy_mass=candy_mass, friction=friction)
+
+
 class Segment(NamedTuple):
     """Ids of a segment's parts in the compiled model."""
 

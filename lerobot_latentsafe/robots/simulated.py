@@ -78,6 +78,12 @@ class SimulatedRobot(Uncalibrated, Robot):
         self.episode += 1
         _connected.append(self)
 
+    def change_scene(self, scene: Any) -> None:
+        """Go on with another scene that has the same cameras and state; it is to be reset then."""
+        self._require_connection()
+        self.scene.close()
+        self.scene = scene
+
     def reset(self, seed: int) -> None:
         """Begin an episode from a seed."""
         self._require_connection()
