@@ -29,6 +29,7 @@ from lerobot_latentsafe.safety_model import SafetyModel
 from lerobot_latentsafe.shield import Shield
 from lerobot_latentsafe.units import Monitored
 from lerobot_latentsafe.unknown import appearance, dynamics
+from lerobot_latentsafe.unknown.appearance import Seen
 from lerobot_latentsafe.unknown.dynamics import Usual
 from lerobot_latentsafe.unknown.monitor import Familiar
 from lerobot_latentsafe.unknown.threshold import TooFewEpisodesError, profile, rank_of
@@ -46,11 +47,11 @@ class Replayed:
     """What a shield made of an episode.
 
     Attributes:
-        seen: (T, C, P, NUMBERS), see `appearance.views`.
+        seen: of all T frames.
         differences: (T, H, D), see `Foretold.differences`; None of a guard.
     """
 
-    seen: np.ndarray
+    seen: Seen
     differences: np.ndarray | None
 
 
@@ -70,12 +71,12 @@ class Gatherer:
 
     def reset(self) -> None:
         """Begin an episode."""
-        self._seen: list[np.ndarray] = []
+        self._seen: list[Seen] = []
         self._differences: list[np.ndarray] = []
         self.share = np.zeros(1, np.float32)
 
     def look(self, images: dict[str, Tensor], seen: np.ndarray) -> np.ndarray:
-        """Keep the patches of a tick."""
+        """Keep what is looked at in a tick."""
         self._seen.append(appearance.views(images, self.keys))
         return np.zeros(len(seen), np.int64)
 
@@ -89,7 +90,7 @@ class Gatherer:
 
     def replayed(self) -> Replayed:
         """What was kept of the episode."""
-        return Replayed(np.concatenate(self._seen), np.concatenate(self._differences) if self.foretells else None)
+        return Replayed(Seen.joined(self._seen), np.concatenate(self._differences) if self.foretells else None)
 
 
 # -- which episodes ---
@@ -212,11 +213,11 @@ def learn(
     first: Sequence[Replayed], second: Sequence[Replayed], third: Sequence[Replayed], smooth: float
 ) -> Familiar:  # fmt: skip
     """All numbers of a monitor, of three parts of the episodes; smoothed over so many ticks."""
-    library = appearance.learn(np.concatenate([episode.seen for episode in first]))
+    library = appearance.learn(Seen.joined([episode.seen for episode in first]))
     usual: Usual | None = None
     if first[0].differences is not None:
         usual = dynamics.learn(np.concatenate([episode.differences for episode in first]))
-    n_scores = 2 * (len(library.mean) + (0 if usual is None else len(usual.mean)))
+    n_scores = appearance.SCORES * len(library.mean) + (0 if usual is None else 2 * len(usual.mean))
     nothing = np.ones(n_scores, np.float32)
     familiar = Familiar(library, usual, profile([nothing[None]], 1.0), nothing, np.zeros(1, np.float32))
     scores = [familiar.scores_of(*vars(episode).values()) for episode in second]

@@ -70,8 +70,7 @@ record bag_pulls bag_pulls 25 100
 record bag_retreats bag_retreats 31 80
 record bag_varied bag_varied 35
 record bag_varied_pulls bag_varied_pulls 37
-record bag_shielded bag_shielded 29 100 # interrupted where the committed bag would act; when these were made, that of 6cf0280
-record bag_shielded_more bag_shielded 33 60
+record bag_shielded bag_shielded 29 60 # interrupted where the committed bag would act; when these were made, that of 430a79f
 record bag_strong bag_strong 0
 record bag_weak bag_weak 0
 record held_branches bag_branches 1 50
@@ -84,7 +83,7 @@ import sys
 from pathlib import Path
 from lerobot.datasets.aggregate import aggregate_datasets
 data = Path(sys.argv[1])
-names = "mix branches climbs lifts middle between dither clumsy policies lifts_more pulls retreats shielded shielded_more"
+names = "mix branches climbs lifts middle between dither clumsy policies lifts_more pulls retreats shielded varied varied_pulls"
 parts = [f"bag_{name}" for name in names.split()]
 aggregate_datasets([f"latentsafe/{p}" for p in parts], "latentsafe/bag", [data / p for p in parts], data / "bag.begun")
 (data / "bag.begun").rename(data / "bag")

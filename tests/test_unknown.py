@@ -19,6 +19,7 @@ from lerobot_latentsafe.dubins import car
 from lerobot_latentsafe.guard import standing_still
 from lerobot_latentsafe.modeling_latentsafe import STATISTICS, load_filter
 from lerobot_latentsafe.monitoring import parts_of
+from lerobot_latentsafe.pictures import averaged
 from lerobot_latentsafe.runtime.checkpoint import CheckpointError, seal_again
 from lerobot_latentsafe.shield import Shield
 from lerobot_latentsafe.unknown import appearance, dynamics
@@ -128,6 +129,8 @@ ALTERED = {
     "noise": lambda x: torch.rand_like(x),
     "a thing in the picture": lambda x: torch.cat([x[..., :20], 0 * x[..., :12] + 0.95, x[..., 32:]], -1),
     "moved": lambda x: x.roll(4, -2),
+    "green for blue": lambda x: torch.where(x[:, 2:] > 0.6, x[:, [0, 2, 1]], x),
+    "an empty scene": lambda x: torch.where(x[:, 2:] > 0.6, 0.3, x),
 }
 
 
@@ -144,7 +147,8 @@ def test_a_picture_unlike_the_data_is_strange(name):
 @pytest.mark.parametrize("size", [20, 32, 64, 96, 224])
 def test_pictures_of_any_size_are_patches_of_one_size(size):
     seen = appearance.views({"a": torch.rand(2, 3, size, size), "b": torch.rand(2, 3, size, size)}, ["a", "b"])
-    assert seen.shape == (2, 2, appearance.GRID**2, appearance.NUMBERS) and np.isfinite(seen).all()
+    assert seen.patches.shape == (2, 2, appearance.GRID**2, appearance.NUMBERS) and np.isfinite(seen.patches).all()
+    assert np.allclose(np.square(seen.colours).sum(-1), min(size, appearance.POINTS) ** 2)
 
 
 @pytest.mark.parametrize("skip, expected", [(1, [1, 3, 6]), (2, [1, 2, 3]), (3, [1, 2]), (10, [1])])
@@ -244,7 +248,8 @@ def test_what_is_familiar_again_passes_after_a_second_without_an_alarm(monitored
 def test_what_the_world_does_stays_strange_until_the_episode_ends(monitored):
     monitor = Shield(monitored.model, clock=standing_still).monitor
     usual = monitor.familiar.usual
-    images = {CAMERA: tiny.observation([[-0.9, 0.1, 0.0]])[CAMERA]}
+    seen = tiny.observation([[-0.9, 0.1, 0.0]])[CAMERA]
+    images = {CAMERA: averaged(seen, monitored.config.world_model.image_size)}  # as a shield shows it
     monitor.look(images, np.ones(1, bool))
     assert monitor.foresee(usual.mean[None] + 100 * usual.deviation) == Reason.UNKNOWN_DYNAMICS
     monitor.end_tick()

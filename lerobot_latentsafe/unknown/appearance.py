@@ -5,9 +5,13 @@ For every patch of every camera a dataset shows a few kinds: table, arm, object.
 from the nearest kind, in standard deviations of that kind (as PaDiM, Defard et al. 2021, with several Gaussians a patch
 instead of one: one that spans table and arm calls everything between them usual).
 
+And a picture has so many points of each colour. Patches overlook a thing of a new colour that is small or moves about,
+and what is gone; the colours of the whole picture do not.
+
 The same was measured on tokens of a frozen encoder: these tell light and small cover worse, and cost more.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +33,14 @@ LEAST = 0.02
 """Least standard deviation of a number: five grey levels, as a live picture was never compressed to a video."""
 STRANGEST = 4
 """Patches whose mean distance is the second score."""
+POINTS, SHADES = 48, 6
+"""Points a side whose colours are counted, and the shades of red, green and blue that are told apart."""
+OFFENDING = 8
+"""Colours whose mean distance is the third score."""
+FURTHEST = 100.0
+"""A colour counts as so far off at most, a squared distance: one that the data lack is infinitely far from nothing."""
+SCORES = 3
+"""Of each camera."""
 FRAMES = 6_000
 """Frames that the kinds are learned from, at most."""
 ROUNDS = 8
@@ -37,22 +49,44 @@ PRIOR = 20
 """Frames that the deviations of all kinds of a patch count for, beside those of the kind itself."""
 
 
+class Seen(NamedTuple):
+    """What is looked at of B frames of C cameras.
+
+    Attributes:
+        patches: (B, C, P, NUMBERS).
+        colours: (B, C, SHADES^3), the root of the number of points of each colour, of POINTS^2 at most.
+    """
+
+    patches: np.ndarray
+    colours: np.ndarray
+
+    @classmethod
+    def joined(cls, parts: Sequence["Seen"]) -> "Seen":
+        """Frames one after the other."""
+        return cls(*(np.concatenate(numbers) for numbers in zip(*parts)))
+
+
 class Library(NamedTuple):
-    """The kinds of each patch: their means, and the inverse variances of their numbers, both (C, P, KINDS, NUMBERS)."""
+    """What is familiar.
+
+    Attributes:
+        mean, precision: of the kinds of each patch, and the inverse variances of their numbers, both (C, P, KINDS,
+            NUMBERS).
+        colours, spread: mean and standard deviation of the roots of counts, both (C, SHADES^3).
+    """
 
     mean: np.ndarray
     precision: np.ndarray
+    colours: np.ndarray
+    spread: np.ndarray
 
 
-def views(images: dict[str, Tensor], keys: list[str]) -> np.ndarray:
-    """Pictures as patches.
+def views(images: dict[str, Tensor], keys: list[str]) -> Seen:
+    """What is looked at of pictures, on the host.
 
     Args:
         images: camera key -> (B, 3, H, W) in [0, 1].
         keys: of the C cameras, in order.
-
-    Returns:
-        (B, C, GRID^2, NUMBERS), on the host.
     """
     pictures = torch.stack([images[key] for key in keys], 1)
     if max(pictures.shape[-2:]) > FINEST:
@@ -62,36 +96,42 @@ def views(images: dict[str, Tensor], keys: list[str]) -> np.ndarray:
     cells = on_host(torch.cat([averaged(pictures, CELLS), detail], -3))
     n, c, of = cells.shape[:3]
     apart_cells = cells.reshape(n, c, of, GRID, 2, GRID, 2)
-    return apart_cells.transpose(0, 1, 3, 5, 2, 4, 6).reshape(n, c, GRID**2, NUMBERS)
+    patches = apart_cells.transpose(0, 1, 3, 5, 2, 4, 6).reshape(n, c, GRID**2, NUMBERS)
+    points = averaged(pictures, POINTS) if max(pictures.shape[-2:]) > POINTS else pictures
+    return Seen(patches, on_host(_colours(points)))
 
 
-def strangeness(seen: np.ndarray, library: Library) -> np.ndarray:
-    """Two scores of each camera: log of the mean distance of all patches, and of the STRANGEST.
+def _colours(points: Tensor) -> Tensor:
+    """Roots of the number of points (..., 3, H, W) of each colour: (..., SHADES^3)."""
+    red, green, blue = (points.clamp(0, 1) * (SHADES - 1e-3)).long().flatten(-2).unbind(-2)
+    colour = (red * SHADES + green) * SHADES + blue
+    counts = points.new_zeros(*colour.shape[:-1], SHADES**3)
+    return counts.scatter_add_(-1, colour, torch.ones_like(colour, dtype=counts.dtype)).sqrt()
 
-    Args:
-        seen: (B, C, P, NUMBERS), see `views`.
 
-    Returns:
-        (B, C, 2).
-    """
-    apart = seen[:, :, :, None] - library.mean
+def strangeness(seen: Seen, library: Library) -> np.ndarray:
+    """Scores (B, C, SCORES) of each camera: logs of the mean distance of all patches, of the STRANGEST of them, and of
+    the OFFENDING colours."""
+    apart = seen.patches[:, :, :, None] - library.mean
     apart *= apart
     apart *= library.precision
     distance = np.sort(apart.mean(-1).min(-1), -1)  # (B, C, P)
-    return np.log(np.stack([distance.mean(-1), distance[..., -STRANGEST:].mean(-1)], -1) + 1e-6)
+    off = np.minimum(np.square((seen.colours - library.colours) / library.spread), FURTHEST)
+    offending = np.partition(off, -OFFENDING, -1)[..., -OFFENDING:]
+    means = [part.mean(-1) for part in (distance, distance[..., -STRANGEST:], offending)]
+    return np.log(np.stack(means, -1) + 1e-6)
 
 
-def learn(seen: np.ndarray) -> Library:
-    """The kinds of each patch, by k-means from starts that lie far apart.
-
-    Args:
-        seen: (N, C, P, NUMBERS) of frames.
-    """
-    if len(seen) > FRAMES:
-        seen = seen[np.random.default_rng(0).choice(len(seen), FRAMES, replace=False)]
-    cameras = [_kinds(torch.from_numpy(np.ascontiguousarray(camera))) for camera in seen.transpose(1, 2, 0, 3)]
+def learn(seen: Seen) -> Library:
+    """What is familiar of N frames: the kinds of each patch by k-means from starts that lie far apart, and colours."""
+    n = len(seen.patches)
+    if n > FRAMES:
+        drawn = np.random.default_rng(0).choice(n, FRAMES, replace=False)
+        seen = Seen(*(numbers[drawn] for numbers in seen))
+    cameras = [_kinds(torch.from_numpy(np.ascontiguousarray(camera))) for camera in seen.patches.transpose(1, 2, 0, 3)]
     means, precisions = zip(*cameras)
-    return Library(np.stack(means), np.stack(precisions))
+    # A point more or less says nothing.
+    return Library(np.stack(means), np.stack(precisions), seen.colours.mean(0), seen.colours.std(0) + 1)
 
 
 def _kinds(x: Tensor) -> tuple[np.ndarray, np.ndarray]:

@@ -14,7 +14,7 @@ from torch import Tensor
 from lerobot_latentsafe.decision import Reason, first_of
 from lerobot_latentsafe.host import any_of
 from lerobot_latentsafe.unknown import appearance, dynamics
-from lerobot_latentsafe.unknown.appearance import Library
+from lerobot_latentsafe.unknown.appearance import Library, Seen
 from lerobot_latentsafe.unknown.dynamics import Usual
 from lerobot_latentsafe.unknown.threshold import Drift, Profile
 
@@ -29,10 +29,10 @@ class StatisticsError(ValueError):
 
 
 class Familiar(NamedTuple):
-    """All numbers that a monitor has learned. Scores are two of each camera, and two of each age of a foretelling.
+    """All numbers that a monitor has learned. Scores are three of each camera, and two of each age of a foretelling.
 
     Attributes:
-        library: of the cameras' patches.
+        library: of the cameras' patches and colours.
         usual: differences of foretellings; None where there is no world model.
         profile: of all S scores.
         scale: (S,), the median M of each score, so that none of them alone sets the threshold.
@@ -73,7 +73,7 @@ class Familiar(NamedTuple):
             part = lambda name, n: [numbers[f"{name}.{i}"] for i in range(n)]  # noqa: E731
             usual = Usual(*part("usual", 4)) if "usual.0" in numbers else None
             found = cls(
-                Library(*part("library", 2)), usual, Profile(*part("profile", 2)), numbers["scale"],
+                Library(*part("library", len(Library._fields))), usual, Profile(*part("profile", 2)), numbers["scale"],
                 numbers["strangest"],
             )  # fmt: skip
         except KeyError as e:
@@ -95,16 +95,21 @@ class Familiar(NamedTuple):
     @property
     def n_scores(self) -> int:
         """S."""
-        return 2 * (self.n_cameras + (0 if self.usual is None else len(self.usual.mean)))
+        return self.n_looks + (0 if self.usual is None else 2 * len(self.usual.mean))
 
-    def scores_of(self, seen: np.ndarray, differences: np.ndarray | None) -> np.ndarray:
+    @property
+    def n_looks(self) -> int:
+        """The first scores, of what the cameras show."""
+        return appearance.SCORES * self.n_cameras
+
+    def scores_of(self, seen: Seen, differences: np.ndarray | None) -> np.ndarray:
         """All scores (N, S) of ticks.
 
         Args:
-            seen: (N, C, P, NUMBERS), see `appearance.views`.
+            seen: of N frames, see `appearance.views`.
             differences: (N, H, D), see `Foretold.differences`; None where there is no world model.
         """
-        looks = appearance.strangeness(seen, self.library).reshape(len(seen), -1)
+        looks = appearance.strangeness(seen, self.library).reshape(-1, self.n_looks)
         return looks if self.usual is None else np.concatenate([looks, self.surprises(differences)], 1)
 
     def surprises(self, differences: np.ndarray) -> np.ndarray:
@@ -235,5 +240,5 @@ class UnknownMonitor:
 
     def _named(self, reason: Reason, score: int) -> str:
         if reason == Reason.UNKNOWN_APPEARANCE:
-            return f"APPEARANCE: {self.keys[score // 2]} shows what the data do not"
+            return f"APPEARANCE: {self.keys[score // appearance.SCORES]} shows what the data do not"
         return "DYNAMICS: what follows from the actions is not what the world model foretold"

@@ -206,12 +206,11 @@ def run(folder: Path, job: dict) -> dict:
         images = {key: frames.float() / 255.0 for key, frames in by_camera.items()}
         looks = appearance.strangeness(appearance.views(images, [*images]), familiar.library)
         scores = np.full((len(shown), familiar.n_scores), np.nan, np.float32)
-        scores[:, : 2 * familiar.n_cameras] = looks.reshape(len(shown), -1)
+        scores[:, : familiar.n_looks] = looks.reshape(len(shown), -1)
     share = familiar.standardised(scores, np.arange(len(scores))) / familiar.threshold(record.rank)
-    n_looks = 2 * familiar.n_cameras
     return {
-        "appearance": _first(share[:, :n_looks] > 1),
-        "dynamics": _first(share[:, n_looks:] > 1),
+        "appearance": _first(share[:, : familiar.n_looks] > 1),
+        "dynamics": _first(share[:, familiar.n_looks :] > 1),
         "harm": _first(episode["spilled"][:, None] > 0),
         "most": round(float(np.nanmax(share)), 3),
     }
