@@ -139,15 +139,15 @@ def parts_of(episodes: list[int], alpha: float, has_reference: bool) -> tuple[li
 
 
 def replay(
-    policy: LatentSafePolicy, meta: LeRobotDatasetMetadata, contract: Contract, episodes: list[int]
+    policy: LatentSafePolicy, meta: LeRobotDatasetMetadata, contract: Contract, episodes: list[int], foretells: bool
 ) -> Iterator[Replayed]:
-    """Episodes of a dataset, as if each action were proposed when it was recorded."""
+    """Episodes of a dataset, as if each action were proposed when it was recorded; see `replayed`."""
     model, frames = policy.model, DatasetFrames(meta, episodes)
     keys = model.world_model.image_keys
     for episode in tqdm(episodes, "looking through healthy episodes", unit="episode", leave=False):
         own, pieces = contract.only([episode]), frames.pieces(keys, episode)
         pictures = ({key: part[key][None] for key in keys} for piece in pieces for part in _each(piece))
-        yield replayed(model, pictures, own.state, own.action)
+        yield replayed(model, pictures, own.state, own.action, foretells)
 
 
 def _each(piece: dict[str, Tensor]) -> Iterator[dict[str, Tensor]]:
@@ -157,16 +157,19 @@ def _each(piece: dict[str, Tensor]) -> Iterator[dict[str, Tensor]]:
 
 @torch.no_grad()
 def replayed(
-    model: SafetyModel, pictures: Iterator[dict[str, Tensor]], state: np.ndarray, action: np.ndarray
-) -> Replayed:
+    model: SafetyModel, pictures: Iterator[dict[str, Tensor]], state: np.ndarray, action: np.ndarray,
+    foretells: bool = True,
+) -> Replayed:  # fmt: skip
     """An episode of a robot.
 
     Args:
         pictures: of each tick, camera key -> uint8 (1, 3, H, W).
         state, action: (T, S) and (T, A) in robot units.
+        foretells: whether the world model, if there is one, foretells what follows.
     """
     shield = Shield(model, clock=standing_still)
-    shield.monitor = gatherer = Gatherer(model.world_model.image_keys, model.config.law.name != "guard")
+    foretells = foretells and model.config.law.name != "guard"
+    shield.monitor = gatherer = Gatherer(model.world_model.image_keys, foretells)
     for seen, s, a in zip(pictures, torch.from_numpy(state), torch.from_numpy(action)):
         images = {key: picture.float() / 255.0 for key, picture in seen.items()}
         shield({**images, OBS_STATE: s[None]}, a[None])
@@ -179,7 +182,7 @@ def replayed(
 
 def fit_monitor(
     policy: LatentSafePolicy, meta: LeRobotDatasetMetadata, contract: Contract, alpha: float = 0.05,
-    reference: tuple[LeRobotDatasetMetadata, Contract] | None = None,
+    reference: tuple[LeRobotDatasetMetadata, Contract] | None = None, foretells: bool = True,
 ) -> LatentSafePolicy:  # fmt: skip
     """The policy with a monitor of the unknown.
 
@@ -188,6 +191,7 @@ def fit_monitor(
         alpha: the chance of any alarm in a healthy episode.
         reference: a recording of what is familiar, such as that which the filter was trained on; by default a part of
             the other one.
+        foretells: whether to watch what follows from the actions, too, where there is a world model.
 
     Raises:
         ValueError: an alpha that is no share, or too few healthy episodes for it.
@@ -203,8 +207,8 @@ def fit_monitor(
         source, episodes = reference, healthy_episodes(*reference, specification)
         lengths = reference[1].only(episodes).lengths
         learned = [episodes[place] for place in sampled_episodes(lengths, appearance.FRAMES)]
-    first = list(replay(policy, *source, learned))
-    second, third = (list(replay(policy, meta, contract, part)) for part in (standard, threshold))
+    first = list(replay(policy, *source, learned, foretells))
+    second, third = (list(replay(policy, meta, contract, part, foretells)) for part in (standard, threshold))
     familiar = learn(first, second, third, SMOOTH_S * meta.fps)
     return with_monitor(policy, familiar, alpha, len(learned) + len(standard))
 

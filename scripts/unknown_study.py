@@ -6,13 +6,14 @@
     scripts/unknown_study.py --policy=outputs/bag_monitored
 
 Writes results/assurance/unknown.json: of each kind the episodes that alarm, those told before candies fly, and by how
-many ticks; of faults of cameras those told within five ticks; false alarms; and what a tick costs. Recordings and each
-score are kept: a killed study goes on.
+many ticks; of faults of cameras those told within five ticks; false alarms; and what a tick costs. The same of the car,
+with another obstacle, speed or turn rate. Recordings of the bag and each score are kept: a killed study goes on.
 """
 
 import argparse
 from pathlib import Path
 
+from lerobot_latentsafe.experiments.assurance.unknown_car import study_car
 from lerobot_latentsafe.experiments.assurance.unknown_study import study
 
 
@@ -25,7 +26,10 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=Path("results/assurance/unknown.json"))
     parser.add_argument("--workers", type=int, default=1)
     arguments = parser.parse_args()
-    study(arguments.policy, arguments.recordings, arguments.n, arguments.healthy, arguments.output, arguments.workers)
+    study(
+        arguments.policy, arguments.recordings, arguments.n, arguments.healthy, arguments.output, arguments.workers,
+        {"car": study_car()},
+    )  # fmt: skip
 
 
 if __name__ == "__main__":

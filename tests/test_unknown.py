@@ -13,9 +13,13 @@ import tiny
 import torch
 
 from lerobot_latentsafe.cli import main
+from lerobot_latentsafe.collection.dubins import random_episodes
 from lerobot_latentsafe.conformal import needed
 from lerobot_latentsafe.decision import ANSWERS, LawConfig, Reason
 from lerobot_latentsafe.dubins import car
+from lerobot_latentsafe.experiments.assurance.unknown_car import HEALTHY, KINDS, seen
+from lerobot_latentsafe.experiments.assurance.unknown_car import driven as driven_car
+from lerobot_latentsafe.experiments.assurance.unknown_study import first_alarms, watched
 from lerobot_latentsafe.guard import standing_still
 from lerobot_latentsafe.modeling_latentsafe import STATISTICS, load_filter
 from lerobot_latentsafe.monitoring import parts_of
@@ -293,6 +297,12 @@ def test_a_law_knows_what_can_be_done_about_the_unknown():
 # -- the verb, and files ---
 
 
+def test_a_filter_may_watch_its_cameras_alone(recording, tiny_filter, tmp_path):
+    folder = monitor(tiny_filter, recording, tmp_path / "monitored", f"--alpha={ALPHA}", "--dynamics=false")
+    shield, decisions = driven(no_looks(load_filter(folder)), unlike)
+    assert not shield.monitor.foretells and decisions[-1].reason == Reason.UNKNOWN_APPEARANCE
+
+
 def test_a_guard_has_the_appearance_alone(recording, tmp_path):
     main(["guard", f"--dataset.root={recording}", f"--output_dir={tmp_path / 'guard'}"])
     folder = monitor(tmp_path / "guard", recording, tmp_path / "monitored", f"--alpha={ALPHA}")
@@ -365,3 +375,21 @@ def test_the_parts_share_no_episode(n, alpha, reference):
     parts = parts_of(list(range(n)), alpha, reference)
     assert sorted(e for part in parts for e in part) == list(range(n))
     assert len(parts[2]) >= needed(alpha) and len(parts[1]) >= 3 and bool(parts[0]) != reference
+
+
+# -- the study of the car ---
+
+
+def test_the_car_of_the_study_drives_as_the_data_do_unless_its_kind_says_otherwise(monitored):
+    episode = next(random_episodes(1, np.random.default_rng(3)))
+    usual = driven_car(KINDS[HEALTHY], episode)
+    assert np.allclose(usual, episode.states, atol=1e-9)
+    moves = [name for name, kind in KINDS.items() if not np.allclose(driven_car(kind, episode), usual)]
+    assert moves == [name for name, kind in KINDS.items() if (kind.speed, kind.turns) != (car.SPEED, 1.0)]
+    cut = replace(episode, states=episode.states[:8], turn_rates=episode.turn_rates[:8])
+    first, *_ = seen(KINDS[HEALTHY], cut)
+    for name in set(KINDS) - {HEALTHY}:
+        pictures, state, action, in_disc = seen(KINDS[name], cut)
+        assert not torch.equal(pictures, first), name
+        row = first_alarms(watched(monitored, {CAMERA: pictures}, state, action), in_disc)
+        assert set(row) == {"appearance", "dynamics", "stopped", "harm", "most"}

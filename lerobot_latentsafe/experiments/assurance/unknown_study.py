@@ -15,7 +15,10 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
+from lerobot.utils.constants import OBS_STATE
+from torch import Tensor
 
+from lerobot_latentsafe.decision import FilterDecision, Reason
 from lerobot_latentsafe.encoders.perception import Perception
 from lerobot_latentsafe.evaluation.statistics import provenance, run_resumable, wilson, write_json
 from lerobot_latentsafe.experiments.filter_settings import fingerprint
@@ -24,16 +27,16 @@ from lerobot_latentsafe.franka.behaviors import begin, grasp
 from lerobot_latentsafe.franka.scene import CAMERAS
 from lerobot_latentsafe.guard import standing_still
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
-from lerobot_latentsafe.monitoring import replayed
 from lerobot_latentsafe.pictures import to_model_images
 from lerobot_latentsafe.runtime.files import replacing
 from lerobot_latentsafe.shield import Shield
-from lerobot_latentsafe.unknown import appearance
 
 STEPS, SIZE = 90, 96
 """Ticks of an episode, its unrecorded grasp included; pixels a side of what is kept."""
 FIRST_SEED = 700_000
 """No filter was trained or set on these."""
+LOOKS_STRANGE = (Reason.UNKNOWN_APPEARANCE, Reason.OBSERVATION_UNFAMILIAR)
+"""The monitor says so, or the guard, which knows noise and cameras that are exchanged or turned."""
 AT_ONCE = 5
 """Ticks within which a fault of a camera is to be told."""
 SHARES = {"rise": (0.5, 0, 0, 0, 0, 0, 0.5), "branch": (0.6, 0, 0, 0.2, 0, 0, 0.2)}
@@ -189,53 +192,78 @@ def _policy(path: str) -> LatentSafePolicy:
 
 
 def run(folder: Path, job: dict) -> dict:
-    """When an episode alarms, and when it does harm: the first tick of each or None, and M as a share of the threshold.
-
-    A fault of a camera, and whatever a monitor without dynamics sees, is scored by the appearance alone.
-    """
+    """One episode of a kind, perhaps with a fault of a camera: see `first_alarms`."""
     policy, episode = _policy(job["policy"]), recorded(folder, job["kind"], job["seed"])
-    familiar, record = policy.model.familiar, policy.config.trained_on.monitor
     pictures = episode["pictures"] if job["fault"] is None else FAULTS[job["fault"]](episode["pictures"])
     shown = torch.from_numpy(np.ascontiguousarray(pictures, dtype=np.uint8))
     by_camera = {f"observation.images.{camera}": shown[:, i] for i, camera in enumerate(CAMERAS)}
-    if job["fault"] is None and familiar.usual is not None:
-        ticks = ({key: frames[t : t + 1] for key, frames in by_camera.items()} for t in range(len(shown)))
-        found = replayed(policy.model, ticks, episode["state"], episode["action"])
-        scores = familiar.scores_of(found.seen, found.differences)
-    else:
-        images = {key: frames.float() / 255.0 for key, frames in by_camera.items()}
-        looks = appearance.strangeness(appearance.views(images, [*images]), familiar.library)
-        scores = np.full((len(shown), familiar.n_scores), np.nan, np.float32)
-        scores[:, : familiar.n_looks] = looks.reshape(len(shown), -1)
-    share = familiar.standardised(scores, np.arange(len(scores))) / familiar.threshold(record.rank)
+    decisions = watched(policy, by_camera, episode["state"], episode["action"])
+    return first_alarms(decisions, episode["spilled"] > 0)
+
+
+@torch.no_grad()
+def watched(
+    policy: LatentSafePolicy, pictures: dict[str, Tensor], state: np.ndarray, action: np.ndarray
+) -> list[FilterDecision]:
+    """What the filter decides along an episode that goes on as it was recorded.
+
+    Args:
+        pictures: camera key -> uint8 (T, 3, H, W).
+        state, action: (T, S) and (T, A) in robot units.
+    """
+    shield, decisions = Shield(policy.model, clock=standing_still), []
+    for t, (s, a) in enumerate(zip(torch.from_numpy(state), torch.from_numpy(action))):
+        images = {key: shown[t : t + 1].float() / 255.0 for key, shown in pictures.items()}
+        decisions.append(shield({**images, OBS_STATE: s[None]}, a[None]))
+        shield.was_executed(a[None])
+    return decisions
+
+
+def first_alarms(decisions: list[FilterDecision], harm: np.ndarray) -> dict:
+    """The first tick, or None, at which an episode's cameras are found strange, its dynamics are, the filter stops
+    anything for whatever reason, and harm is done; and M as a share of the threshold.
+
+    Args:
+        harm: bool (T,) or longer.
+    """
+    reasons = np.array([decision.reason.item() for decision in decisions])
+    strange = [decision.unknown.item() for decision in decisions]
     return {
-        "appearance": _first(share[:, : familiar.n_looks] > 1),
-        "dynamics": _first(share[:, familiar.n_looks :] > 1),
-        "harm": _first(episode["spilled"][:, None] > 0),
-        "most": round(float(np.nanmax(share)), 3),
+        "appearance": _first(np.isin(reasons, LOOKS_STRANGE)),
+        "dynamics": _first(reasons == Reason.UNKNOWN_DYNAMICS),
+        "stopped": _first(np.array([decision.unsafe.item() for decision in decisions])),
+        "harm": _first(harm),
+        "most": round(float(np.max(strange)), 3),
     }
 
 
 def _first(found: np.ndarray) -> int | None:
-    """The first tick (T, N) at which any is true."""
-    ticks = np.flatnonzero(found.any(1))
+    """The first tick (T,) at which it is true."""
+    ticks = np.flatnonzero(found)
     return int(ticks[0]) if len(ticks) else None
 
 
+def _before(tick: int | None, harm: int) -> bool:
+    return tick is not None and tick < harm
+
+
 def summary(rows: list[dict]) -> dict:
-    """Of the episodes of one kind: those that alarm, at once and at all; those told before harm, and by how many ticks.
+    """Of the episodes of one kind: those that alarm, at once and at all; those told before harm, and by how many ticks;
+    and those that do harm without a word: neither an alarm nor a low value before.
 
     Args:
         rows: of `run`.
     """
     alarms = [min((t for t in (row["appearance"], row["dynamics"]) if t is not None), default=None) for row in rows]
     harmed = [(alarm, row["harm"]) for alarm, row in zip(alarms, rows) if row["harm"] is not None]
-    leads = [harm - alarm for alarm, harm in harmed if alarm is not None and alarm < harm]
+    silent = [row for row in rows if row["harm"] is not None and not _before(row["stopped"], row["harm"])]
+    leads = [harm - alarm for alarm, harm in harmed if _before(alarm, harm)]
     return {
         "alarmed": wilson(sum(alarm is not None for alarm in alarms), len(rows)),
         "at_once": wilson(sum(alarm is not None and alarm < AT_ONCE for alarm in alarms), len(rows)),
         "by_dynamics": sum(row["dynamics"] is not None for row in rows),
         "told_before_harm": wilson(len(leads), len(harmed)) if harmed else None,
+        "without_a_word": wilson(len(silent), len(harmed)) if harmed else None,
         "median_lead_ticks": float(np.median(leads)) if leads else None,
         "median_most": float(np.median([row["most"] for row in rows])),
     }
@@ -264,12 +292,15 @@ def cost_ms(policy: LatentSafePolicy, episode: dict[str, np.ndarray]) -> dict[st
     return {**medians, "added": round(added, 3)}
 
 
-def study(path: str, folder: Path, n: int, healthy: int, output: Path, workers: int = 1) -> None:
+def study(
+    path: str, folder: Path, n: int, healthy: int, output: Path, workers: int = 1, others: dict | None = None
+) -> None:
     """Score a monitored filter of the bag on every kind and fault; write the table.
 
     Args:
         folder: of the recordings, made where they are missing.
         n: episodes of a kind; healthy: of the bag that is known.
+        others: tables of other robots, to stand beside it.
     """
     folder.mkdir(parents=True, exist_ok=True)
     common = {"policy": path, "fingerprint": fingerprint(path)}
@@ -289,6 +320,7 @@ def study(path: str, folder: Path, n: int, healthy: int, output: Path, workers: 
             "kinds": {kind: table[kind] for kind in KINDS if kind != HEALTHY},
             "camera_faults": {fault: table[fault] for fault in FAULTS},
             "cost_ms": cost_ms(_policy(path), recorded(folder, HEALTHY, FIRST_SEED)),
+            **(others or {}),
         },
         **provenance([FIRST_SEED, FIRST_SEED + max(n, healthy) - 1]),
     }  # fmt: skip
