@@ -1,6 +1,6 @@
 """Unsafe recordings are replayed on bags that the filter never saw: other colours, table, stiffness, weight."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -18,12 +18,24 @@ from lerobot_latentsafe.experiments.bag.runs import (
     traces,
 )
 from lerobot_latentsafe.experiments.filter_settings import FilterSetting, as_job, in_use
-from lerobot_latentsafe.franka.bag import VARIANTS
+from lerobot_latentsafe.franka.bag import VARIANTS, Variant
 from lerobot_latentsafe.franka.behaviors import Actions, begin
 from lerobot_latentsafe.reports.figures import save, value_profiles
 
 SEEN = "red"
 UNSEEN = [name for name in VARIANTS if name not in (SEEN, "sealed")]
+MECHANICS = {
+    "stiffness .05": Variant(stiffness=0.05),
+    "stiffness .12": Variant(stiffness=0.12),
+    "stiffness .20": Variant(stiffness=0.20),
+    "stiffness .0075": Variant(stiffness=0.0075),
+    "candies of 3 g": Variant(candy_mass=0.003),
+    "candies of 4.5 g": Variant(candy_mass=0.0045),
+    "friction .2": Variant(friction=0.2),
+    "friction .05": Variant(friction=0.05),
+}
+"""Bags that look like the red one. Of stiffness, weight and friction the first, fifth and seventh lie within what
+`bag_varied` shows, the others beyond."""
 
 
 @lru_cache(maxsize=128)
@@ -44,28 +56,32 @@ def _noted(operator: Actions, actions: list[np.ndarray]) -> Iterator[np.ndarray]
 
 def run(job: dict) -> dict:
     """One replay, see `drive`."""
-    policy, scene = load(FilterSetting.from_job(job["filter"])), bag_scene(job["variant"])
+    variant = job["variant"]
+    policy, scene = load(FilterSetting.from_job(job["filter"])), bag_scene(MECHANICS.get(variant, variant))
     actions = iter(recording(job["seed"]))
     scene.reset(job["seed"])
     return drive(scene, policy, actions)
 
 
-def compare_variants(settings: list[FilterSetting], n: int, output: Path, workers: int = 1) -> None:
-    """Replay on every variant, bare and under each filter; write the table and a picture beside it.
+def compare_variants(
+    settings: list[FilterSetting], n: int, output: Path, workers: int = 1, unseen: Sequence[str] = UNSEEN
+) -> None:
+    """Replay on the red bag and others, bare and under each filter; write the table and a picture beside it.
 
     Args:
         settings: filters under one law; the first one's values are drawn.
         n: starts.
         output: of the table, .json.
+        unseen: the other bags, of UNSEEN or MECHANICS.
     """
     cells = {
         (variant, setting): {"variant": variant, "filter": as_job(setting)}
         for setting in (None, *settings)
-        for variant in (SEEN, *UNSEEN)
+        for variant in (SEEN, *unseen)
     }
     runs, made_by = run_cells(output, cells, n, run, workers)
     table, n_candies, first = {}, bag_scene(SEEN).n_candies, settings[0]
-    for variant in (SEEN, *UNSEEN):
+    for variant in (SEEN, *unseen):
         bare, shielded = runs[variant, None], {setting.path: runs[variant, setting] for setting in settings}
         table[variant] = {"bare": summary(bare, n_candies), **against_bare(bare, shielded, n_candies)}
         for name, cell in table[variant].items():

@@ -15,7 +15,7 @@ from lerobot_latentsafe.evaluation.rollouts import Actor, Choice, PolicyActor, s
 from lerobot_latentsafe.evaluation.statistics import paired_p_value, provenance, run_resumable, wilson
 from lerobot_latentsafe.experiments.filter_settings import FilterSetting
 from lerobot_latentsafe.experiments.scene_world import FRONT, OperatorActor, SceneWorld, picture
-from lerobot_latentsafe.franka.bag import BagScene
+from lerobot_latentsafe.franka.bag import BagScene, Variant
 from lerobot_latentsafe.franka.behaviors import Actions
 from lerobot_latentsafe.franka.scene import CAMERAS
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
@@ -31,7 +31,7 @@ N_TRACES = 5
 
 
 @cache
-def bag_scene(variant: str = "red") -> BagScene:
+def bag_scene(variant: str | Variant = "red") -> BagScene:
     """The bag of this process."""
     return BagScene(variant)
 
