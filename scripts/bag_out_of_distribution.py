@@ -7,7 +7,7 @@ From each start a careless operator lifts the red bag by its closed end, unfilte
 replayed, as it is, on every variant, bare and under each filter. Writes results/bag/out_of_distribution.json: spills,
 candies lost, steps overridden, step of the first override; and out_of_distribution.png beside it, V along the first
 starts under the first filter. With --mechanics the other bags look like the red one, and only stiffness, weight or
-friction differ: results/bag/mechanics.json. Each run is kept in a .jsonl beside the output: a killed experiment goes on.
+friction differ: results/bag/mechanics.json. Runs are kept in a .jsonl beside the output: a killed experiment goes on.
 """
 
 import argparse
