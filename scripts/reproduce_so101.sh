@@ -2,7 +2,7 @@
 # The SO-101: its data, two ACT policies, three filters and the comparison, from nothing, resumable: a step whose output
 # exists is skipped.
 #   scripts/reproduce_so101.sh [OUT]     OUT defaults to outputs/so101; recordings go to data, or to $DATA
-# WORLD_MODEL=dino_wm trains the filters on DINO-WMs instead, into outputs/so101_dino_wm, and compares nothing.
+# WORLD_MODEL=dino_wm trains the filters on DINO-WMs instead, into outputs/so101_dino_wm, and lets operators push under them.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 WORLD_MODEL=${WORLD_MODEL:-rssm} DATA=${DATA:-data} SEEDS=${SEEDS:-0 1 2}
@@ -61,11 +61,14 @@ fi
 for seed in $SEEDS; do
   filter "$seed"
 done
-[ "$WORLD_MODEL" = rssm ] || exit 0
+filters=$(for seed in $SEEDS; do echo "$OUT/filter_$seed"; done)
+if [ "$WORLD_MODEL" = dino_wm ]; then
+  $BIN/python scripts/so101_operators.py --filters $filters
+  exit 0
+fi
 
 policies="$OUT/act_reckless/checkpoints/last/pretrained_model $OUT/act_careful/checkpoints/last/pretrained_model"
 $BIN/python scripts/so101_ranges.py --policies $policies --datasets "$DATA/so101_reckless" "$DATA/so101_careful"
-filters=$(for seed in $SEEDS; do echo "$OUT/filter_$seed"; done)
 $BIN/python scripts/so101_policies.py --reckless=${policies% *} --careful=${policies#* } --filters $filters
 $BIN/python scripts/so101_policies.py --reckless=${policies% *} --careful=${policies#* } --filters $filters \
   --law.name=margin --law.epsilon=0 --output=results/so101/margin.json

@@ -3,6 +3,7 @@ import pytest
 
 from lerobot_latentsafe.experiments import so101
 from lerobot_latentsafe.so101.actions import NAMES
+from lerobot_latentsafe.so101.scene import PushScene
 
 
 def test_what_leaves_the_range_is_counted_in_shares_of_it():
@@ -12,3 +13,12 @@ def test_what_leaves_the_range_is_counted_in_shares_of_it():
     assert left["leave_it"] == pytest.approx(2 / 3) and left["by_more_than_0.1"] == pytest.approx(1 / 3)
     assert left["beyond"]["p100"] == pytest.approx(0.25)
     assert left["each"] == pytest.approx(dict(zip(NAMES, [1 / 3, 0, 0, 0, 0, 2 / 3])))
+
+
+def test_a_reckless_operator_pushes_the_cube_over_the_edge_and_a_careful_one_does_not():
+    scene = PushScene()
+    rows = {
+        behavior: so101.operate(scene, None, behavior, so101.FIRST_SEED + 1) for behavior in ("reckless", "careful")
+    }
+    assert rows["reckless"] == {"violation": True, "success": False, "overridden": 0.0}
+    assert rows["careful"] == {"violation": False, "success": True, "overridden": 0.0}

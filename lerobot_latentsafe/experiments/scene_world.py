@@ -72,7 +72,7 @@ class OperatorActor:
     """A scripted operator, who goes on trying where a filter overrides.
 
     Args:
-        operator: what it does.
+        operator: what it does; a Franka's hand stays where it ends.
         filter: what it is shielded by; None: nothing.
     """
 
@@ -84,8 +84,8 @@ class OperatorActor:
             filter.reset()
 
     def __call__(self, batch: dict[str, Tensor]) -> Choice:
-        still: np.ndarray = np.append(np.zeros(6), self.action[6])
-        self.action = next(self.operator, still)
+        wanted = next(self.operator, None)
+        self.action = np.append(np.zeros(6), self.action[6]) if wanted is None else wanted
         if self.filter is None:
             return Choice(self.action[None])
         decision = self.filter.shield(batch, torch.from_numpy(self.action).float()[None])

@@ -1,19 +1,23 @@
-"""ACT policies push the cube with the SO-101, bare and under filters, from the same starts; and what they command."""
+"""ACT policies and operators push the cube with the SO-101, bare and under filters, from the same starts; and what the
+policies command."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import ACTION, OBS_STATE
+from tqdm import trange
 
 from lerobot_latentsafe.base_policy import BasePolicy
 from lerobot_latentsafe.decision import LawOptions
 from lerobot_latentsafe.envs.configuration_envs import LatentSafeSO101Env
-from lerobot_latentsafe.evaluation.rollouts import Episodes, count_reasons, run_episodes
-from lerobot_latentsafe.evaluation.statistics import paired_p_value
+from lerobot_latentsafe.evaluation.rollouts import Episodes, count_reasons, run_episodes, steps
+from lerobot_latentsafe.evaluation.statistics import paired_p_value, wilson
+from lerobot_latentsafe.experiments.scene_world import OperatorActor, SceneWorld
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
-from lerobot_latentsafe.so101.actions import NAMES
-from lerobot_latentsafe.so101.scene import STATE
+from lerobot_latentsafe.so101.actions import CAMERAS, EPISODE_SECONDS, FPS, NAMES, REST
+from lerobot_latentsafe.so101.operators import Targets, begin
+from lerobot_latentsafe.so101.scene import STATE, PushScene
 
 FIRST_SEED = 100_000_000
 """Of the starts: none that a dataset was recorded from."""
@@ -41,6 +45,48 @@ def compare_policies(bases: Mapping[str, str], filters: Sequence[str], n: int, l
             "filters": {filter: {**shielded.rates(), **_beside(bare, shielded)} for filter, shielded in runs.items()},
         }
     return table
+
+
+def compare_operators(filters: Sequence[str], n: int, law: LawOptions) -> dict[str, dict]:
+    """The reckless and the careful operator from n starts, bare and under each filter.
+
+    Returns:
+        operator -> bare, or the filter's path: rates of falls and successes, and the share of steps overridden.
+    """
+    scene, table = PushScene(), {}
+    for behavior in ("reckless", "careful"):
+        cells = {"bare": None, **{path: load_filter(path, law=law) for path in filters}}
+        table[behavior] = {}
+        for name, filter in cells.items():
+            rows = [operate(scene, filter, behavior, FIRST_SEED + i) for i in trange(n, desc=f"{behavior}, {name}")]
+            table[behavior][name] = {
+                **{key: wilson(sum(row[key] for row in rows), n) for key in ("violation", "success")},
+                "overridden_share": float(np.mean([row["overridden"] for row in rows])),
+            }
+    return table
+
+
+def operate(scene: PushScene, filter: LatentSafePolicy | None, behavior: str, seed: int) -> dict:
+    """One episode of an operator, who keeps the arm where it is at the end."""
+    scene.reset(seed)
+    operator = _kept(begin(behavior, scene, np.random.default_rng([3, seed])))
+    world = SceneWorld(scene, round(EPISODE_SECONDS * FPS), () if filter is None else CAMERAS)
+    done = list(steps(world, OperatorActor(operator, filter)))
+    fell = any(step.info["failure"] for step in done)
+    overridden = [step.decision is not None and step.decision.intervened.item() for step in done]
+    return {
+        "violation": fell,
+        "success": bool(done[-1].info["is_success"] and not fell),
+        "overridden": float(np.mean(overridden)),
+    }
+
+
+def _kept(targets: Targets) -> Iterator[np.ndarray]:
+    last = REST
+    for last in targets:
+        yield last
+    while True:
+        yield last
 
 
 def run(policy: BasePolicy | LatentSafePolicy, n: int) -> Episodes:
