@@ -70,7 +70,7 @@ record bag_pulls bag_pulls 25 100
 record bag_retreats bag_retreats 31 80
 record bag_varied bag_varied 35
 record bag_varied_pulls bag_varied_pulls 37
-record bag_shielded bag_shielded 29 40 # interrupted where the committed bag would act; when these were made, that of 430a79f
+record bag_shielded bag_shielded 29 30 # interrupted where the committed bag would act; when these were made, that of 430a79f
 record bag_strong bag_strong 0
 record bag_weak bag_weak 0
 record held_branches bag_branches 1 50
