@@ -94,10 +94,10 @@ class LatentSafeConfig(PreTrainedConfig):
         target, law = self.trained_on.target, self.law.name
         if target not in BACKUPS:
             raise ValueError(f"target is {target!r}; expected one of {', '.join(BACKUPS)}")
-        if self.trained_on.stage == "critic" and law in BACKUPS and law != target:
+        if self.trained_on.stage == "critic" and self.law.critic not in (None, target):
             raise CriticTargetError(
                 f"--policy.law.name is {law!r}, but this filter's critic was trained for {target!r}; use it with "
-                f"--policy.law.name={target}, or train one with latentsafe train-reachability --target={law}"
+                f"--policy.law.name={target}, or train one with latentsafe train-reachability --target={self.law.critic}"
             )
 
     def require_known_commands(self) -> None:
