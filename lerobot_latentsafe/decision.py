@@ -90,9 +90,10 @@ class LawConfig:
 
     Attributes:
         name: what V is, and what is done where it is too low. `reachability` falls back. `nearest` has the same V, and
-            executes the nearest action to the proposal that passes, if it finds one. The others are baselines: `risk`, which needs a critic trained for it, `plan`, which
-            imagines holding each action, and `margin`, which reads l alone and stands still. `guard` has no V: it
-            checks ranges, cameras and times alone, and stays where something is wrong.
+            executes the nearest action to the proposal that passes, if it finds one. The others are baselines: `risk`,
+            which needs a critic trained for it, `plan`, which imagines holding each action, and `margin`, which reads l
+            alone and stands still. `guard` has no V: it checks ranges, cameras and times alone, and stays where
+            something is wrong.
         epsilon: the fallback acts where V of the predicted next latent is at or below this threshold. A risk critic's V
             is -risk, so SQRL's threshold of 0.1 is an epsilon of -0.1.
         resume_above: once the fallback has acted, the base policy acts again only where V is above this, if that is
@@ -219,16 +220,16 @@ class FilterDecision:
     """One decision for each row of a batch; actions in robot units.
 
     Attributes:
-        action: (B, A), what to execute: the proposal, clipped into the data's range, the nearest action to it that
-            passes, or the fallback.
+        action: (B, A), what to execute: the proposal, clipped into the data's range; or the nearest action to it that
+            passes; or the fallback.
         proposed: (B, A), what the base policy wanted.
         value: (B,), V of the latent predicted under the proposed action.
         margin: (B,), l of the current latent; negative means it looks like a failure already.
         unsafe: bool (B,), the law's verdict on the proposed action.
-        intervened: bool (B,), whether the filter acts: `action` is not the policy's; never in monitor mode.
+        intervened: bool (B,), whether the filter acts, so that `action` is not the policy's; never in monitor mode.
         reason: int64 (B,), a `Reason`.
-        adjusted: bool (B,), whether `action` is the nearest one to the proposal that passes, by the law `nearest`; where
-            the filter acts and this is false, the fallback acts.
+        adjusted: bool (B,), whether `action` is the nearest one to the proposal that passes, by the law `nearest`.
+            Where the filter acts and this is false, the fallback acts.
         heard: (B, A), the action that was judged, as the world model heard it; of faulty rows that is to stay. None
             where there is none that hears, by the law of a guard.
         unknown: (B,), how strange things are, as a share of the monitor's threshold: above 1 it alarms. None without a
@@ -384,7 +385,9 @@ def _choose(
     passing = proposed if monitor or passing is None else passing
     action = np.where(intervened[:, None], fallback, passing)
     adjusted = np.zeros_like(unsafe)
-    return FilterDecision(*map(torch.from_numpy, (action, proposed, value, margin, unsafe, intervened, reason, adjusted)))
+    return FilterDecision(
+        *map(torch.from_numpy, (action, proposed, value, margin, unsafe, intervened, reason, adjusted))
+    )
 
 
 def or_else(fault: np.ndarray, found: np.ndarray | int) -> np.ndarray:

@@ -150,7 +150,7 @@ CALIBRATED = """## How often it misses
 
 """
 
-RATES = ("spilled", "spills_below_5_percent", "violation", "incompletion", "success")
+RATES = ("spilled", "spills_below_5_percent", "violation", "stall", "incompletion", "success")
 
 
 def make_model_card(

@@ -213,8 +213,8 @@ class LatentSafePolicy(PreTrainedPolicy):
         """Whether what is done is so far from what the base policy wanted that it is to plan anew, or be told."""
         if decision.falls_back.any() or (self.base.is_told and decision.intervened.any()):
             return True
-        away = self.shield.nearest.distance(on_host(decision.action), on_host(decision.proposed))
-        return bool((away[on_host(decision.adjusted, torch.bool)] > self.config.law.replan_above).any())
+        away = self.shield.nearest.deviation(decision)[on_host(decision.adjusted, torch.bool)]
+        return bool((away > self.config.law.replan_above).any())
 
     def _ask_base(self, batch: dict[str, Tensor], age_s: float) -> tuple[Tensor | None, Reason]:
         """What the base policy proposes; None, and why, if it gives nothing in time."""

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from lerobot_latentsafe.decision import FilterDecision
 from lerobot_latentsafe.host import all_of, on_host
 from lerobot_latentsafe.latent import Latent, map_latent
 from lerobot_latentsafe.limits import Limits
@@ -18,12 +19,12 @@ from lerobot_latentsafe.units import Units
 
 BLENDS = 8
 DRAWS = 32
-WIDEST = 0.5
+WIDEST = 1.0
 """Standard deviation of the widest draws, in standardised units."""
-PROJECTIONS = (1.0, 1.5, 2.5)
+PROJECTIONS = (1.5,)
 """How far candidates go along the slope of V, in multiples of what would just pass if V were linear."""
-SHORTLIST = 4
-"""Candidates that are judged as any proposal is."""
+SHORTLIST = 3
+"""Candidates beside those that are judged as any proposal is."""
 
 
 class Asked(NamedTuple):
@@ -147,7 +148,6 @@ class Nearest:
         kappa = self.model.config.law.kappa
         actions, sound = self.candidates.checked(asked, self.candidates.beside(asked))
         rough = self._value(asked, actions, roughly=True)
-        rough = rough + (asked.value - rough[0])  # as far as is known, what the critic alone errs by is the same
         more, sound_too = self.candidates.checked(asked, self.candidates.along(asked, actions, rough))
         away = self.distance(actions, asked.proposed)
         picked = shortlist(rough, away, sound, asked.threshold, kappa)
@@ -162,6 +162,10 @@ class Nearest:
             np.where(found[:, None], actions[chosen, rows], np.nan).astype(np.float32),
             np.where(found, number[chosen, rows], -1),
         )
+
+    def deviation(self, decision: FilterDecision) -> np.ndarray:
+        """How far what is executed is from what was proposed, in standardised units: (B,); NaN of no proposal."""
+        return self.distance(on_host(decision.action), on_host(decision.proposed))
 
     def _value(self, asked: Asked, actions: np.ndarray, roughly: bool = False) -> np.ndarray:
         """V of actions (N, R, A) in robot units: (N, R); what is no number is not asked about."""
@@ -189,9 +193,7 @@ def shortlist(
     return np.concatenate([value.argmax(0)[None], nearest])
 
 
-def choose(
-    value: np.ndarray, away: np.ndarray, threshold: np.ndarray, kappa: float, last: np.ndarray
-) -> np.ndarray:
+def choose(value: np.ndarray, away: np.ndarray, threshold: np.ndarray, kappa: float, last: np.ndarray) -> np.ndarray:
     """Of candidates (N, R) the nearest with V above the threshold (R,) and within kappa of the best; -1: none (R,).
 
     Args:

@@ -242,15 +242,19 @@ class SafetyModel(nn.Module):
         return torch.where(is_sound(latent), self.worst(margin, value), torch.nan)
 
     def value_of_holding(self, latent: Latent, heard: Tensor, roughly: bool = False) -> Tensor:
-        """V of actions (B, A), as they are heard, each held from a latent: (B,).
+        """A lower bound of V of actions (B, A), as they are heard, each held from a latent: (B,).
+
+        What comes after them follows the critic's policy alone, not the best of several as in `plan`. So it is cheaper.
 
         Args:
-            roughly: by one future, and by the critic alone, without looking ahead.
+            roughly: by one future, and without looking ahead: no bound, but cheaper still.
         """
-        n = 1 if roughly else max(1, self.config.law.samples)
-        predicted, least = self.go_on(latent, heard[:, None].repeat(1, self.config.world_model.frame_skip, 1), n)
-        value = self.critic.value(*self.imagination.judged(predicted)) if roughly else self.value(predicted)
-        return self.through(latent, self.imagination.margin(latent), least, value)
+        law, sizes, imagination = self.config.law, self.config.world_model, self.imagination
+        n, horizon = (1, 0) if roughly else (max(1, law.samples), sizes.steps(law.lookahead))
+        predicted, least = self.go_on(latent, heard[:, None].repeat(1, sizes.frame_skip, 1), n)
+        none_held = self.units.still[:0]
+        value = look_ahead(imagination, predicted, none_held, horizon, self.critic)[0]
+        return self.through(latent, imagination.margin(latent), least, value)
 
     @property
     def _stage_of_law(self) -> str:

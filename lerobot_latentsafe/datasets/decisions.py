@@ -21,9 +21,9 @@ class Journal:
     """Rows of decisions by episode and frame, for a parquet file.
 
     Columns: episode_index, frame_index, proposed and executed (lists of float, robot units), value, margin, intervened,
-    adjusted (see `FilterDecision`; journals of versions before have none), reason (the name of a `Reason`); of a filter with a monitor of the unknown also unknown (share of its threshold) and
-    drift (the session's evidence E). What was executed tells which dataset it belongs to. Frames count from 0 in each
-    episode; the pauses between episodes leave no rows.
+    adjusted (journals of versions before 0.3 have none), reason (the name of a `Reason`); of a filter with a monitor of
+    the unknown also unknown (share of its threshold) and drift (the session's evidence E). What was executed tells
+    which dataset it belongs to. Frames count from 0 in each episode; the pauses between episodes leave no rows.
 
     Raises:
         ValueError: the file exists and is not readable.
