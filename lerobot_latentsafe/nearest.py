@@ -114,9 +114,10 @@ class Candidates:
     def along(self, asked: Asked, candidates: np.ndarray, value: np.ndarray) -> np.ndarray:
         """Actions (P, R, A) along the slope of V, fitted to the values (N, R) of candidates (N, R, A)."""
         scale = np.where(self.moves, self.half_range, 1.0)
-        away = np.where(self.moves, (candidates - asked.proposed) / scale, 0.0).swapaxes(0, 1).astype(np.float64)
-        known = np.isfinite(value.T)[..., None]  # what is no number says nothing of the slope
-        away, rise = np.where(known, away, 0.0), np.where(known, (value - value[0]).T[..., None], 0.0)
+        known = np.isfinite(value) & np.isfinite(value[0])  # what is no number says nothing of the slope
+        away = np.where(self.moves & known[..., None], (candidates - asked.proposed) / scale, 0.0)
+        away, level = away.swapaxes(0, 1).astype(np.float64), np.where(known, value, 0.0)
+        rise = np.where(known, level - level[0], 0.0).T[..., None]
         square = away.swapaxes(1, 2) @ away + 1e-6 * np.eye(away.shape[-1])
         slope = np.linalg.solve(square, away.swapaxes(1, 2) @ rise)[..., 0]
         lacks = (asked.threshold - asked.value)[:, None] / np.maximum((slope**2).sum(-1, keepdims=True), 1e-6)

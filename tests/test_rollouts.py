@@ -158,13 +158,14 @@ def test_outcomes_by_hand():
     episodes = Episodes(
         success=flags(1, 0, 0, 0),
         violation=flags(0, 1, 0, 0),
+        stall=flags(0, 0, 1, 0),
         steps=np.array([10, 10, 10, 10]),
         overridden=np.array([0, 4, 0, 0]),
         action_change=np.array([0.0, 2.0, 0.0, 0.0]),
         severity=np.array([0.0, 0.5, 0.0, 0.0]),
     )
     rates = episodes.rates()
-    assert [rates[k]["k"] for k in ("success", "violation", "incompletion")] == [1, 1, 2]
+    assert [rates[k]["k"] for k in ("success", "violation", "stall", "incompletion")] == [1, 1, 1, 2]
     assert rates["overridden_share"] == pytest.approx(0.1) and rates["mean_action_change"] == pytest.approx(0.05)
 
 
