@@ -37,9 +37,9 @@ class LatentSafeShielded(WrappedRobot):
 
     Observations also hold `shield.value`, `shield.margin` (not a number before the first decision) and
     `shield.intervened` of the last decision: recordings leave them out, `--display_data=true` shows them. The law
-    `nearest` adds `shield.adjusted` (1 where the nearest action that passes is executed, not the fallback). A filter with
-    a monitor of the unknown adds `shield.unknown` (share of its threshold, above 1 it alarms) and `shield.hand_over`
-    (1 where a person is asked to take over).
+    `nearest` adds `shield.adjusted` (1 where the nearest action that passes is executed, not the fallback), a monitor
+    of the unknown `shield.unknown` (share of its threshold, above 1 it alarms) and `shield.hand_over` (1 where a person
+    is asked to take over).
 
     Attributes:
         inner: the robot that moves.
