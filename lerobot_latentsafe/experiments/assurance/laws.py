@@ -39,55 +39,68 @@ class Study(NamedTuple):
         drivers: name -> path of a policy; of the bag, name of an operator.
         env: where policies drive; None: an operator and the bag.
         first_seed: of the starts. Settings are chosen on others.
+        together: episodes side by side at most, as `latentsafe eval-shield` runs them.
     """
 
     filter: str
     drivers: dict[str, str]
     env: type[EnvConfig] | None
     first_seed: int
+    together: int
 
 
 STUDIES = {
     "car": Study(
-        "dubins", {name: f"dubins_diffusion_{name}" for name in ("reckless", "careful")}, LatentSafeDubinsEnv, 960_000
+        "dubins",
+        {name: f"dubins_diffusion_{name}" for name in ("reckless", "careful")},
+        LatentSafeDubinsEnv,
+        960_000,
+        50,
     ),
-    "bag": Study("bag", {name: name for name in ("closed_end", "side_to_side_0.15")}, None, 320_000),
-    "blocks": Study("blocks", {"dreamer": "blocks_dreamer"}, LatentSafeBlocksEnv, 420_000),
+    "bag": Study("bag", {name: name for name in ("closed_end", "side_to_side_0.15")}, None, 320_000, 1),
+    "blocks": Study("blocks", {"dreamer": "blocks_dreamer"}, LatentSafeBlocksEnv, 420_000, 10),
 }
 
 
 def jobs_of(name: str, driver: str, n: int) -> dict[str, list[dict]]:
-    """`bare` and each law -> a job for each start, of one driver of a study."""
+    """`bare` and each law -> jobs for so many starts, of one driver of a study."""
     study = STUDIES[name]
     settings = {"bare": None, **{law: FilterSetting.of(study.filter, LawOptions(name=law)) for law in LAWS}}
     made_of = None if study.env is None else fingerprint(study.drivers[driver])
     job = {"study": name, "driver": driver, "made_of": made_of}
-    seeds = range(study.first_seed, study.first_seed + n)
-    return {law: [{**job, "filter": as_job(s), "seed": seed} for seed in seeds] for law, s in settings.items()}
+    parts = [{"seed": study.first_seed + i, "n": min(study.together, n - i)} for i in range(0, n, study.together)]
+    return {law: [{**job, "filter": as_job(s), **part} for part in parts] for law, s in settings.items()}
 
 
 def run(job: dict) -> dict:
-    """One episode.
+    """Episodes from n starts.
 
     Returns:
-        violation, success, stall; and of each step under a filter: changed, adjusted (see `FilterDecision`), and
-        deviation from the proposal in standardised units.
+        episodes: of each violation, success, stall; and of each step under a filter: changed, adjusted (see
+        `FilterDecision`), and deviation from the proposal in standardised units.
     """
     torch.set_num_threads(1)
     study, setting = STUDIES[job["study"]], FilterSetting.from_job(job["filter"])
     if study.env is None:
-        row = operators.run({**job, "operator": study.drivers[job["driver"]]})
-        spilled, success = row["lost"] > 0, bool(row["success"])
-        outcome = {"violation": spilled, "success": success and not spilled, "stall": not (success or spilled)}
-        return {**outcome, "changed": row["intervened"], "adjusted": row["adjusted"], "deviation": row["deviation"]}
+        return {"episodes": [_lifted(operators.run({**job, "operator": study.drivers[job["driver"]]}))]}
     policy = operators.load(setting, study.drivers[job["driver"]])
-    episode = run_episodes(policy, study.env(), 1, job["seed"])
-    row, trace = {name: bool(getattr(episode, name)[0]) for name in OUTCOMES}, episode.traces[0]
+    runs = run_episodes(policy, study.env(), job["n"], job["seed"])
+    rows = [{name: bool(getattr(runs, name)[i]) for name in OUTCOMES} for i in range(job["n"])]
     if setting is None:
-        return row
-    done, wanted = (np.array(trace[name], np.float32) for name in ("action", "proposed"))
-    away = Distance(policy.model.units)(done, wanted).round(4).tolist()
-    return {**row, "changed": trace["intervened"], "adjusted": trace["adjusted"], "deviation": away}
+        return {"episodes": rows}
+    distance = Distance(policy.model.units)
+    for row, trace in zip(rows, runs.traces):
+        done, wanted = (np.array(trace[name], np.float32) for name in ("action", "proposed"))
+        away = distance(done, wanted).round(4).tolist()
+        row |= {"changed": trace["intervened"], "adjusted": trace["adjusted"], "deviation": away}
+    return {"episodes": rows}
+
+
+def _lifted(row: dict) -> dict:
+    """An operator's episode of the bag."""
+    spilled, success = row["lost"] > 0, bool(row["success"])
+    outcome = {"violation": spilled, "success": success and not spilled, "stall": not (success or spilled)}
+    return {**outcome, "changed": row["intervened"], "adjusted": row["adjusted"], "deviation": row["deviation"]}
 
 
 def cell(rows: list[dict]) -> dict:
@@ -205,9 +218,10 @@ def study(counts: dict[str, int], n_timed: int, output: Path, workers: int = 1) 
     ran = iter(run_resumable(output.with_suffix(".jsonl"), every, run, workers))
     summary, minutes = {}, 0.0
     for (name, who), laws in jobs.items():
-        rows = {law: [next(ran) for _ in cell_jobs] for law, cell_jobs in laws.items()}
+        parts = {law: [next(ran) for _ in cell_jobs] for law, cell_jobs in laws.items()}
+        minutes += sum(part["cpu_s"] for of in parts.values() for part in of) / 60
+        rows = {law: [row for part in of for row in part["episodes"]] for law, of in parts.items()}
         cells = {law: cell(of) for law, of in rows.items()}
-        minutes += sum(row["cpu_s"] for of in rows.values() for row in of) / 60
         found = {**cells, "nearest_to_reachability": against(cells, rows)}
         found["tick_ms"] = tick_cost(name, who, n_timed)
         summary[f"{name}, {who}"] = found
