@@ -102,6 +102,7 @@ def test_every_episode_is_counted_once(result):
     for name in ("bare", "shielded"):
         rates = result[name]
         counts = [rates[outcome]["k"] for outcome in ("success", "violation", "incompletion")]
+        assert rates["stall"]["k"] <= rates["incompletion"]["k"]
         assert sum(counts) == N and all(rates[outcome]["n"] == N for outcome in ("success", "violation"))
         assert 0 <= rates["success"]["low"] <= rates["success"]["high"] <= 1
 

@@ -59,6 +59,7 @@ def in_use(settings: list[FilterSetting]) -> dict[str, dict]:
     for setting in settings:
         row, own = rows.setdefault(setting.path, {}), law_of(setting.path)
         row |= {"epsilon": setting.epsilon, "guard": setting.proposal_steps, "release": setting.resume_above}
+        row |= {name: getattr(setting, name) for name in ("kappa", "replan_above") if setting.law == "nearest"}
         row |= {"memory": own.history_frames} if own.history_frames else {}
         if own.retreat:
             row |= {"retreat": own.retreat, "patience": own.retreat_after, "dwell": own.min_retreat_steps}
