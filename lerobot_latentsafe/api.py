@@ -128,8 +128,8 @@ def evaluate_filter(
         video: a folder for videos of the first episodes, bare and shielded side by side.
 
     Returns:
-        `bare` and `shielded`: success, violation, incompletion as {k, n, low, high} with 95% Wilson intervals, and
-        overridden_share; violation_p_value; reasons; episodes: both as `Episodes`.
+        `bare` and `shielded`: success, violation, stall and incompletion as {k, n, low, high} with 95% Wilson
+        intervals, and overridden_share; violation_p_value; reasons; episodes: both as `Episodes`.
 
     Raises:
         ValueError: nothing to shield, or an environment of another rate, action space or camera.

@@ -157,6 +157,11 @@ class BasePolicy:
             logger.warning("chunks of the base policy (%s) cannot be read: %s", self.config.type, e)
             return None
 
+    @property
+    def is_told(self) -> bool:
+        """Whether the policy remembers its actions, and wants to be told of each that was not done."""
+        return hasattr(self.policy, "was_overridden")
+
     def replan(self, executed: Tensor) -> None:
         """Drop the rest of a planned chunk: after an intervention it belongs to a state that never came.
 
@@ -164,7 +169,7 @@ class BasePolicy:
         (B, A) in robot units.
         """
         self.coming = None
-        if hasattr(self.policy, "was_overridden"):
+        if self.is_told:
             theirs = inverse(self._action_order)
             return self.policy.was_overridden(executed if theirs is None else executed[:, theirs])
         if self.chunks is not None:

@@ -27,6 +27,8 @@ DECIDING = (
     "retreat_after", "min_retreat_steps",
 )  # fmt: skip
 """What of a law changes V or the decision; the rest says what is in time, and whether it acts."""
+OF_NEAREST = ("kappa", "replan_above")
+"""What of the law `nearest` does so, too."""
 MORE = "hold out more episodes (--dataset.episodes, --n_episodes)"
 
 
@@ -296,7 +298,7 @@ def belonging(law: LawConfig, weights: str, base_policy: str | None, name: str |
         weights, base_policy: digests; see `runtime.checkpoint.weights_digest`. None: no policy was named.
         name: of the base policy, for people.
     """
-    decides = {key: getattr(law, key) for key in DECIDING}
+    decides = {key: getattr(law, key) for key in (*DECIDING, *(OF_NEAREST if law.name == "nearest" else ()))}
     return {"law": decides, "weights": weights, "base_policy": base_policy, "base_policy_name": name}
 
 

@@ -91,13 +91,13 @@ class LatentSafeConfig(PreTrainedConfig):
         Raises:
             CriticTargetError: naming both.
         """
-        target, law = self.trained_on.target, self.law.name
+        target, law, needed = self.trained_on.target, self.law.name, self.law.critic
         if target not in BACKUPS:
             raise ValueError(f"target is {target!r}; expected one of {', '.join(BACKUPS)}")
-        if self.trained_on.stage == "critic" and law in BACKUPS and law != target:
+        if self.trained_on.stage == "critic" and needed not in (None, target):
             raise CriticTargetError(
                 f"--policy.law.name is {law!r}, but this filter's critic was trained for {target!r}; use it with "
-                f"--policy.law.name={target}, or train one with latentsafe train-reachability --target={law}"
+                f"--policy.law.name={target}, or train one with latentsafe train-reachability --target={needed}"
             )
 
     def require_known_commands(self) -> None:

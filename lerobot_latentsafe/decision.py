@@ -8,7 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-LAWS = ("reachability", "risk", "plan", "margin", "guard")
+LAWS = ("reachability", "nearest", "risk", "plan", "margin", "guard")
+CRITICS = {"reachability": "reachability", "nearest": "reachability", "risk": "risk"}
+"""Laws that read a critic -> what that must have been trained for."""
 MODES = ("filter", "monitor")
 ANSWERS = ("warn", "slow", "hold", "hand_over")
 """What may be done about what is unknown."""
@@ -49,7 +51,7 @@ class LawOptions:
     """Changes of a filter's law; what is not given stays as it is. See `LawConfig`."""
 
     name: str | None = None
-    """reachability, risk, plan, margin or guard."""
+    """reachability, nearest, risk, plan, margin or guard."""
     epsilon: float | None = None
     """The fallback acts where V is at or below this threshold."""
     resume_above: float | None = None
@@ -68,6 +70,10 @@ class LawOptions:
     """Overrides in the last ten steps after which the next override is the retreat's."""
     min_retreat_steps: int | None = None
     """Steps for which a retreat goes on at least."""
+    kappa: float | None = None
+    """Law nearest: V of what is executed is at most so far below V of the safest candidate."""
+    replan_above: float | None = None
+    """Law nearest: the base policy plans anew after a larger change, in standardised units."""
     deadline_ms: float | None = None
     """A decision that took longer than this is not trusted, be the observation fresh or not."""
     slack_ms: float | None = None
@@ -83,9 +89,11 @@ class LawConfig:
     """When the filter acts, and what it does then. A user may change all of it.
 
     Attributes:
-        name: what V is: `reachability`; or a baseline: `risk`, which needs a critic trained for it, `plan`, which
-            imagines holding each action, and `margin`, which reads l alone and stands still. `guard` has no V: it
-            checks ranges, cameras and times alone, and stays where something is wrong.
+        name: what V is, and what is done where it is too low. `reachability` falls back. `nearest` has the same V, and
+            executes the nearest action to the proposal that passes, if it finds one. The others are baselines: `risk`,
+            which needs a critic trained for it, `plan`, which imagines holding each action, and `margin`, which reads l
+            alone and stands still. `guard` has no V: it checks ranges, cameras and times alone, and stays where
+            something is wrong.
         epsilon: the fallback acts where V of the predicted next latent is at or below this threshold. A risk critic's V
             is -risk, so SQRL's threshold of 0.1 is an epsilon of -0.1.
         resume_above: once the fallback has acted, the base policy acts again only where V is above this, if that is
@@ -103,6 +111,10 @@ class LawConfig:
             same for waiting at a doubtful place as for leaving it, so the critic may wait.
         retreat_after: overrides in the last ten steps after which the next override is the retreat's.
         min_retreat_steps: steps for which a retreat goes on at least: a single step leads nowhere.
+        kappa: of the law `nearest`: among candidates that pass, those whose V is more than this below the safest one's
+            are not taken. 0 takes the safest; 2, the width of all values, asks no more than to pass.
+        replan_above: of the law `nearest`: a change of the proposal by more than this makes the base policy plan anew,
+            as an override does. In standardised units: half the range that the data show of a command is 1.
         deadline_ms: if set, a decision that took longer is not trusted, be the observation fresh or not.
         slack_ms: by so much an observation may be older than a period of the data's rate when the action leaves.
             Beyond that nothing passes.
@@ -122,6 +134,8 @@ class LawConfig:
     retreat: dict[str, float] = field(default_factory=dict)
     retreat_after: int = 0
     min_retreat_steps: int = 1
+    kappa: float = 0.2
+    replan_above: float = 0.25
     deadline_ms: float | None = None
     slack_ms: float = 0.0
     mode: str = "filter"
@@ -136,6 +150,8 @@ class LawConfig:
             "proposal_steps": (1 <= self.proposal_steps <= 25, "1 (the paper's law) to 25 steps"),
             "retreat_after": (0 <= self.retreat_after <= RECENT, f"0 (retreat at once) to {RECENT} overrides"),
             "min_retreat_steps": (self.min_retreat_steps >= 1, "at least 1 step"),
+            "kappa": (0 <= self.kappa <= 2, "0 (the safest candidate) to 2 (any that passes)"),
+            "replan_above": (0 <= self.replan_above < math.inf, "a distance in standardised units, 0 or more"),
             "history_frames": (self.history_frames == 0 or self.history_frames >= 2, "0 (all) or at least 2 frames"),
             "resume_above": (self.resume_above < 1, "less than 1, which V never exceeds"),
             "samples": (self.samples >= 0, "0 (mean or mode) or a number of draws"),
@@ -162,6 +178,11 @@ class LawConfig:
         return replace(self, **given)
 
     @property
+    def critic(self) -> str | None:
+        """What a critic that this law reads must have been trained for; None if it reads none."""
+        return CRITICS.get(self.name)
+
+    @property
     def stops_at_the_unknown(self) -> bool:
         """Whether nothing passes where things are unknown."""
         return self.unknown in ("hold", "hand_over")
@@ -180,13 +201,17 @@ class LawConfig:
         return None
 
     def passes_nothing_more_than(self, other: "LawConfig") -> bool:
-        """Whether every action that passes under this law passes under the other, too, which decides on the same V."""
+        """Whether every action that passes under this law passes under the other, too, which decides on the same V.
+
+        What the law `nearest` puts in place of a proposal has passed as one.
+        """
         ordered = ("epsilon", "resume_above", "min_retreat_steps")
         stricter = all(getattr(self, name) >= getattr(other, name) for name in ordered)
         in_time = other.deadline_ms is None or (self.deadline_ms is not None and self.deadline_ms <= other.deadline_ms)
         in_time &= self.slack_ms <= other.slack_ms
-        times = ("deadline_ms", "slack_ms")
-        alike = replace(self, **{name: getattr(other, name) for name in (*ordered, *times, "mode")}) == other
+        free = [*ordered, "deadline_ms", "slack_ms", "mode", "kappa", "replan_above"]
+        free += ["name"] if self.critic is not None and self.critic == other.critic else []
+        alike = replace(self, **{name: getattr(other, name) for name in free}) == other
         return self.mode == "filter" and alike and stricter and in_time
 
 
@@ -195,13 +220,16 @@ class FilterDecision:
     """One decision for each row of a batch; actions in robot units.
 
     Attributes:
-        action: (B, A), what to execute: the proposal, clipped into the data's range, or the fallback.
+        action: (B, A), what to execute: the proposal, clipped into the data's range; or the nearest action to it that
+            passes; or the fallback.
         proposed: (B, A), what the base policy wanted.
         value: (B,), V of the latent predicted under the proposed action.
         margin: (B,), l of the current latent; negative means it looks like a failure already.
         unsafe: bool (B,), the law's verdict on the proposed action.
-        intervened: bool (B,), whether `action` is the fallback's; never in monitor mode.
+        intervened: bool (B,), whether the filter acts, so that `action` is not the policy's; never in monitor mode.
         reason: int64 (B,), a `Reason`.
+        adjusted: bool (B,), whether `action` is the nearest one to the proposal that passes, by the law `nearest`.
+            Where the filter acts and this is false, the fallback acts.
         heard: (B, A), the action that was judged, as the world model heard it; of faulty rows that is to stay. None
             where there is none that hears, by the law of a guard.
         unknown: (B,), how strange things are, as a share of the monitor's threshold: above 1 it alarms. None without a
@@ -218,10 +246,16 @@ class FilterDecision:
     unsafe: Tensor
     intervened: Tensor
     reason: Tensor
+    adjusted: Tensor
     heard: Tensor | None = None
     unknown: Tensor | None = None
     hand_over: Tensor | None = None
     drift: Tensor | None = None
+
+    @property
+    def falls_back(self) -> Tensor:
+        """Where the fallback acts: bool (B,)."""
+        return self.intervened & ~self.adjusted
 
     def to(self, device: torch.device) -> "FilterDecision":
         """The same, on a device."""
@@ -249,11 +283,25 @@ def heeding(decision: FilterDecision, alarms: np.ndarray, law: LawConfig, slowed
     )
 
 
+def adjusting(decision: FilterDecision, nearest: np.ndarray) -> FilterDecision:
+    """A decision on the host, with the nearest actions that pass in place of the fallback for proposals that do not.
+
+    Whatever else is wrong with a row, the fallback acts.
+
+    Args:
+        nearest: (B, A) in robot units; NaN where there is none.
+    """
+    found = np.isfinite(nearest).all(-1) & (decision.reason.numpy() == Reason.UNSAFE_VALUE)
+    adjusted = found & decision.intervened.numpy()
+    action = np.where(adjusted[:, None], nearest, decision.action.numpy())
+    return replace(decision, action=torch.from_numpy(action), adjusted=torch.from_numpy(adjusted))
+
+
 class Overrides:
-    """What the law's threshold and its retreat depend on: which of the last steps of B robots were overridden.
+    """What the law's threshold and its retreat depend on: in which of the last steps the fallbacks of B robots acted.
 
     Attributes:
-        recent: bool (B, RECENT), whether the filter acted, the latest last.
+        recent: bool (B, RECENT), whether the fallback acted, the latest last.
         retreated: int64 (B,), steps of a retreat that goes on.
     """
 
@@ -272,7 +320,7 @@ class Overrides:
         return (self.retreated > 0) | tried if law.retreat else np.zeros_like(tried)
 
     def after(self, acts: np.ndarray, retreats: np.ndarray) -> "Overrides":
-        """One step on: whether the filter acted, and whether an override is the retreat's, bool (B,)."""
+        """One step on: whether the fallback acted, and whether that was the retreat's, bool (B,)."""
         new = Overrides(len(acts))
         new.recent[:, :-1], new.recent[:, -1] = self.recent[:, 1:], acts
         new.retreated = (self.retreated + 1) * (acts & retreats)
@@ -336,7 +384,10 @@ def _choose(
     intervened = np.zeros_like(unsafe) if monitor else unsafe
     passing = proposed if monitor or passing is None else passing
     action = np.where(intervened[:, None], fallback, passing)
-    return FilterDecision(*map(torch.from_numpy, (action, proposed, value, margin, unsafe, intervened, reason)))
+    adjusted = np.zeros_like(unsafe)
+    return FilterDecision(
+        *map(torch.from_numpy, (action, proposed, value, margin, unsafe, intervened, reason, adjusted))
+    )
 
 
 def or_else(fault: np.ndarray, found: np.ndarray | int) -> np.ndarray:

@@ -338,6 +338,11 @@ class Guard:
         self._proposals.append(clipped)
         return fault, wanted, self._tell_clipped(wanted, clipped, fault)
 
+    @property
+    def proposed_before(self) -> list[np.ndarray]:
+        """What was proposed before the last proposal, as far as jumps are told by it: (B, A) in robot units each."""
+        return [*self._proposals][:-1]
+
     def _check_coming(self, clipped: np.ndarray, planned: np.ndarray) -> np.ndarray:
         """The first thing that is wrong with any action that is planned to come (B, N, A) after one (B, A): (B,)."""
         coming = check_plan(self.limits, np.concatenate([clipped[:, None], planned], 1))[:, 1:]

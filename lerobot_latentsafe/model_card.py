@@ -150,7 +150,7 @@ CALIBRATED = """## How often it misses
 
 """
 
-RATES = ("spilled", "spills_below_5_percent", "violation", "incompletion", "success")
+RATES = ("spilled", "spills_below_5_percent", "violation", "stall", "incompletion", "success")
 
 
 def make_model_card(
@@ -245,6 +245,11 @@ def threshold(law: LawConfig) -> str:
 
 def fallback(law: LawConfig) -> str:
     """What acts in place of an unsafe action, in words."""
+    nearest = "the nearest action that passes; where none is found, " if law.name == "nearest" else ""
+    return nearest + _last_resort(law)
+
+
+def _last_resort(law: LawConfig) -> str:
     if not law.retreat:
         return "the critic's action"
     moves = ", ".join(f"{name} {motion:+g} a step" for name, motion in law.retreat.items())

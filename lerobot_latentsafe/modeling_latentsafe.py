@@ -205,9 +205,16 @@ class LatentSafePolicy(PreTrainedPolicy):
         decision = self._judge(batch, proposed, age_s, missing_reason=wrong, **plan)
         # A policy that is only late keeps its plan where the robots stayed meanwhile.
         stayed = wrong == Reason.DEADLINE_MISSED and self.shield.guard.holding.all()
-        if decision.intervened.any() and not stayed:
+        if self._breaks_the_plan(decision) and not stayed:
             self._replan(decision.action, self.shield.patience(len(decision.action)))
         return decision
+
+    def _breaks_the_plan(self, decision: FilterDecision) -> bool:
+        """Whether what is done is so far from what the base policy wanted that it is to plan anew, or be told."""
+        if decision.falls_back.any() or (self.base.is_told and decision.intervened.any()):
+            return True
+        away = self.shield.nearest.deviation(decision)[on_host(decision.adjusted, torch.bool)]
+        return bool((away > self.config.law.replan_above).any())
 
     def _ask_base(self, batch: dict[str, Tensor], age_s: float) -> tuple[Tensor | None, Reason]:
         """What the base policy proposes; None, and why, if it gives nothing in time."""

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
 from lerobot_latentsafe.critic import BACKUPS, SafetyCritic, safety_bellman_target
 from lerobot_latentsafe.datasets.clips import Clip
-from lerobot_latentsafe.latent import Latent
+from lerobot_latentsafe.latent import Latent, is_sound, map_latent
 from lerobot_latentsafe.limits import Limits
 from lerobot_latentsafe.margin import FailureMargin, hinge_loss
 from lerobot_latentsafe.meanings import MeaningError
@@ -205,18 +205,61 @@ class SafetyModel(nn.Module):
         if law.name == "margin":
             margin = self.imagination.margin(latent)
             return margin, self.imagination.complete(latent, still.expand(len(margin), -1))
-        critic = self.critic if law.name in BACKUPS else None
+        critic = self.critic if law.critic else None
         horizon = self.config.world_model.steps(law.lookahead)
         return look_ahead(self.imagination, latent, self.critic.held_actions(still), horizon, critic)
 
     def worst(self, margin: Tensor, value: Tensor) -> Tensor:
         """The value of going through a margin l to a latent of some value, all (...,): Eq. 5 undiscounted."""
-        return BACKUPS.get(self.config.law.name, safety_bellman_target)(margin, value, 1.0)
+        return BACKUPS.get(self.config.law.critic, safety_bellman_target)(margin, value, 1.0)
+
+    def go_on(self, latent: Latent, ahead: Tensor, n: int = 1) -> tuple[Latent, Tensor]:
+        """n x B latents after `law.proposal_steps` ticks, and the least margin until there (n x B,).
+
+        Args:
+            ahead: (B, K, A), actions as they are heard: the first step hears these, those after it the last, held.
+            n: futures of each latent.
+        """
+        law, imagination = self.config.law, self.imagination
+        action, held = ahead.flatten(1).repeat(n, 1), ahead[:, -1].repeat(n, ahead.shape[1])
+        latent = map_latent(latent, lambda t: t.repeat(n, *[1] * (t.dim() - 1)))
+        least = torch.full_like(action[:, 0], torch.inf)
+        for _ in range(self.config.world_model.steps(law.proposal_steps)):
+            latent, action = imagination.follow(latent, action), held
+            least = torch.minimum(least, imagination.margin(latent))
+        return latent, least
+
+    def through(self, latent: Latent, margin: Tensor, least: Tensor, value: Tensor) -> Tensor:
+        """V of actions (B,): of the worst future of each, and of what is now.
+
+        A margin that is negative now, or on the way, is a failure whatever comes after.
+
+        Args:
+            latent, margin: B latents now, and l of them.
+            least, value: (n x B,) of `go_on`, and V of the latents that it leads to.
+        """
+        value = self.worst(least, value).view(-1, len(margin)).amin(0)
+        return torch.where(is_sound(latent), self.worst(margin, value), torch.nan)
+
+    def value_of_holding(self, latent: Latent, heard: Tensor, roughly: bool = False) -> Tensor:
+        """A lower bound of V of actions (B, A), as they are heard, each held from a latent: (B,).
+
+        What comes after them follows the critic's policy alone, not the best of several as in `plan`. So it is cheaper.
+
+        Args:
+            roughly: by one future, and without looking ahead: no bound, but cheaper still.
+        """
+        law, sizes, imagination = self.config.law, self.config.world_model, self.imagination
+        n, horizon = (1, 0) if roughly else (max(1, law.samples), sizes.steps(law.lookahead))
+        predicted, least = self.go_on(latent, heard[:, None].repeat(1, sizes.frame_skip, 1), n)
+        none_held = self.units.still[:0]
+        value = look_ahead(imagination, predicted, none_held, horizon, self.critic)[0]
+        return self.through(latent, imagination.margin(latent), least, value)
 
     @property
     def _stage_of_law(self) -> str:
-        law = self.config.law.name
-        return "critic" if law in BACKUPS else "guard" if law == "guard" else "world_model"
+        law = self.config.law
+        return "critic" if law.critic else "guard" if law.name == "guard" else "world_model"
 
     def is_trained_for_law(self) -> bool:
         """Whether training has come far enough for the law to decide."""

@@ -24,6 +24,7 @@ from lerobot_latentsafe.decision import (
     FilterDecision,
     Overrides,
     Reason,
+    adjusting,
     by_checks_alone,
     first_of,
     heeding,
@@ -32,7 +33,8 @@ from lerobot_latentsafe.decision import (
 )
 from lerobot_latentsafe.guard import UNSEEN, Guard, Pace, Seen
 from lerobot_latentsafe.host import on_host
-from lerobot_latentsafe.latent import Belief, Latent, is_sound, map_latent, replace_rows
+from lerobot_latentsafe.latent import Belief, Latent, is_sound, replace_rows, select
+from lerobot_latentsafe.nearest import Asked, Found, Nearest
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
 from lerobot_latentsafe.runtime.time_limit import TimeLimit
 from lerobot_latentsafe.safety_model import SafetyModel
@@ -49,7 +51,8 @@ class Judgement(NamedTuple):
         belief: of the episode, with what is seen now.
         value, margin: (B,), V of the action and l now; NaN where nothing can be known.
         fallback: (B, A) in robot units.
-        retreats: bool (B,), whether an override would be the retreat's.
+        retreats: bool (B,), whether the fallback would be the retreat.
+        nearest: the nearest action that passes, of robots whose proposal does not, by the law `nearest`.
         foretold: of the next frame that this belief will see.
         differences: (B, H, D), what was foretold minus what is believed now; None without a monitor that foretells.
     """
@@ -59,6 +62,7 @@ class Judgement(NamedTuple):
     margin: np.ndarray
     fallback: np.ndarray
     retreats: np.ndarray
+    nearest: Found
     foretold: Foretold = Foretold()
     differences: np.ndarray | None = None
 
@@ -76,6 +80,7 @@ class Shield:
     Attributes:
         guard: checks what is seen and told.
         monitor: of the unknown; None where the filter has none. It remembers the session's episodes.
+        nearest: looks for the nearest action that passes, by the law `nearest`.
         pace: of the decisions.
         beliefs: of the episode, by the frames that the world model has seen: where its step is several ticks, every so
             many frames, beginning with one, with the next, and so on. The first is the one that sees the next frame.
@@ -87,6 +92,7 @@ class Shield:
     def __init__(self, model: SafetyModel, clock: Callable[[], float] = time.perf_counter):
         self.model, self.clock, self.guard = model, clock, Guard(model)
         self.monitor = monitor_of(model)
+        self.nearest = Nearest(model)
         self.pace = Pace(model.config.trained_on.fps)
         self.failures: Counter[str] = Counter()
         self.took_s, self._warm = 0.0, False
@@ -121,6 +127,7 @@ class Shield:
         self.observed: dict[str, Tensor] | None = None
         self.decision: FilterDecision | None = None
         self.overrides: Overrides | None = None
+        self._accepted: np.ndarray | None = None
         self._has_acted = False
 
     @torch.no_grad()
@@ -138,7 +145,7 @@ class Shield:
             # In the thread that decides later on, as what is made at first use is made for each thread.
             seconds = None if self.patience() is None else math.inf
             ahead = self._hear_ahead(self._hear(hold, self.guard.pose), fault)
-            self._judge(Seen(images, self.guard.pose, fault), fault, ahead, hold, seconds)
+            self._judge(Seen(images, self.guard.pose, fault), fault, hold, ahead, hold, seconds)
             self._warm = True
             self._forget()
 
@@ -192,7 +199,7 @@ class Shield:
             judged = np.where((faults != Reason.PASSED)[:, None], hold, clipped)
             heard = None if law.name == "guard" else self._hear(judged, self.guard.pose)
             ahead = None if heard is None else self._hear_ahead(heard, faults, coming)
-            judgement, faults = self._judge(seen, faults, ahead, hold, self.patience(len(hold)))
+            judgement, faults = self._judge(seen, faults, judged, ahead, hold, self.patience(len(hold)))
             if judgement.differences is not None:
                 alarms = self.monitor.foresee(judgement.differences)
                 faults = or_else(faults, alarms) if law.stops_at_the_unknown else faults
@@ -251,19 +258,23 @@ class Shield:
         return faults if in_time else or_else(faults, reason)
 
     def _judge(
-        self, seen: Seen, faults: np.ndarray, ahead: Tensor | None, hold: np.ndarray, seconds: float | None
-    ) -> tuple[Judgement, np.ndarray]:
-        """What the world model says of the actions of a step as it hears them (B, K, A), and the faults with its own.
+        self, seen: Seen, faults: np.ndarray, judged: np.ndarray, ahead: Tensor | None, hold: np.ndarray,
+        seconds: float | None,
+    ) -> tuple[Judgement, np.ndarray]:  # fmt: skip
+        """What the world model says of actions (B, A), and the faults with its own.
+
+        Args:
+            ahead: the actions of a step of the world model, of which these are the first, as it hears them: (B, K, A).
 
         A world model that has not answered after so many seconds, or that failed, has missed a frame. So it remembers
         nothing, and the next tick begins with what it sees.
         """
         nothing = np.full(len(hold), np.nan, np.float32)
-        unknown = Judgement(Belief(), nothing, nothing, hold, np.zeros(len(hold), bool))
+        unknown = Judgement(Belief(), nothing, nothing, hold, np.zeros(len(hold), bool), Found.nothing(*hold.shape))
         if self.model.config.law.name == "guard":
             return unknown, faults
         try:
-            return self._in_time(lambda: self._imagine(seen, faults, ahead, hold), seconds)
+            return self._in_time(lambda: self._imagine(seen, faults, judged, ahead, hold), seconds)
         except TimeoutError as e:
             self.note_failure("the filter was late", e)
             reason = Reason.DEADLINE_MISSED
@@ -272,7 +283,9 @@ class Shield:
             reason = Reason.FILTER_FAILED
         return unknown, or_else(faults, reason)
 
-    def _imagine(self, seen: Seen, faults: np.ndarray, ahead: Tensor, hold: np.ndarray) -> tuple[Judgement, np.ndarray]:
+    def _imagine(
+        self, seen: Seen, faults: np.ndarray, judged: np.ndarray, ahead: Tensor, hold: np.ndarray
+    ) -> tuple[Judgement, np.ndarray]:
         """Take in what is seen, and look ahead; changes nothing here, as it may be late."""
         percepts = self._perceive(seen)
         unsound = ~is_sound(percepts)
@@ -281,8 +294,9 @@ class Shield:
         belief = self._filter_history(percepts, seen.state, before, blind)
         foretold, differences = self._foretell(belief.latent, before, blind)
         value, margin, fallback, retreats = self._look_ahead(belief.latent, ahead, hold)
-        judgement = Judgement(belief, value, margin, fallback, retreats, foretold, differences)
-        return judgement, or_else(faults, first_of({Reason.FILTER_FAILED: on_host(unsound, torch.bool)}))
+        faults = or_else(faults, first_of({Reason.FILTER_FAILED: on_host(unsound, torch.bool)}))
+        nearest = self._find_nearest(belief.latent, value, faults, judged, fallback, hold)
+        return Judgement(belief, value, margin, fallback, retreats, nearest, foretold, differences), faults
 
     def _perceive(self, seen: Seen) -> dict[str, Tensor]:
         return self.model.world_model.perceive(seen.images)
@@ -308,17 +322,39 @@ class Shield:
         """V of actions (B, K, A), l now (B,); the fallback (B, A); whether an override would be the retreat's (B,)."""
         model = self.model
         margin = model.imagination.margin(latent)
-        predicted, on_the_way = self._go_on(latent, ahead)
+        predicted, on_the_way = model.go_on(latent, ahead, max(1, model.config.law.samples))
         both = {key: torch.cat([predicted[key], latent[key]]) for key in latent}  # one pass through imagination
         sizes = [len(on_the_way), len(hold)]
         (value, here), (_, action) = (part.split(sizes) for part in model.plan(both))
-        # A margin that is negative now, or on the way, is a failure whatever comes after.
-        value = model.worst(on_the_way, value).view(-1, len(hold)).amin(0)
-        value = torch.where(is_sound(latent), model.worst(margin, value), torch.nan)
+        value = model.through(latent, margin, on_the_way, value)
         retreats, known = self.overrides.retreats(model.config.law), np.isfinite(on_host(here))
         moves = retreats & known  # where nothing is known, nothing moves
         fallback = np.where(moves[:, None], self._retreat(hold), self._usable(action, known, hold))
         return on_host(value), on_host(margin), fallback, retreats
+
+    def _find_nearest(
+        self, latent: Latent, value: np.ndarray, faults: np.ndarray, proposed: np.ndarray, fallback: np.ndarray,
+        hold: np.ndarray,
+    ) -> Found:  # fmt: skip
+        """Of robots whose proposal has no fault but V, the nearest action that passes, if the law asks for one."""
+        law, found = self.model.config.law, Found.nothing(*hold.shape)
+        if law.name != "nearest" or law.mode == "monitor":
+            return found
+        threshold = self.overrides.threshold(law)
+        unsafe = (faults == Reason.PASSED) & np.isfinite(value) & ~(value > threshold) & np.isfinite(threshold)
+        rows = np.flatnonzero(unsafe)
+        if not len(rows):
+            return found
+        accepted = found.candidate if self._accepted is None else self._accepted
+        of = lambda numbers: numbers[rows]  # noqa: E731
+        nearest = self.nearest.find(
+            Asked(
+                select(latent, self.model.tensor(rows)), *map(of, (proposed, fallback, hold, self.guard.pose)),
+                [*map(of, self.guard.proposed_before)], *map(of, (value, threshold, accepted)),
+            )
+        )  # fmt: skip
+        found.action[rows], found.candidate[rows] = nearest
+        return found
 
     def _decide(
         self,
@@ -336,10 +372,12 @@ class Shield:
             return by_checks_alone(proposed, hold, faults, monitors, clipped)
         threshold = self.overrides.threshold(law)
         fallback = np.where(self._stays(faults, value, threshold, seen.state), hold, judgement.fallback)
-        return least_restrictive(proposed, fallback, value, judgement.margin, threshold, faults, monitors, clipped)
+        decision = least_restrictive(proposed, fallback, value, judgement.margin, threshold, faults, monitors, clipped)
+        return adjusting(decision, judgement.nearest.action)
 
     def _remember(self, judgement: Judgement, decision: FilterDecision, observation: dict[str, Any]) -> None:
-        self.overrides = self.overrides.after(decision.intervened.numpy(), judgement.retreats)
+        self.overrides = self.overrides.after(decision.falls_back.numpy(), judgement.retreats)
+        self._accepted = np.where(decision.adjusted.numpy(), judgement.nearest.candidate, -1)
         self.beliefs.append(judgement.belief)  # in place of the one that it grew out of
         self.foretold.append(judgement.foretold)
         blind = np.isin(decision.reason.numpy(), UNSEEN)
@@ -451,7 +489,7 @@ class Shield:
                     continue
                 self.beliefs, self._told_at = other.beliefs.copy(), other._told_at.copy()
                 self.foretold = other.foretold.copy()
-                for name in ("observed", "decision", "overrides", "_in_sight"):
+                for name in ("observed", "decision", "overrides", "_accepted", "_in_sight"):
                     setattr(self, name, getattr(other, name))
                 self.guard.adopt(other.guard)
                 if self.monitor is not None and other.monitor is not None:
@@ -504,22 +542,6 @@ class Shield:
 
         n_frames = self.model.config.world_model.steps(self.model.config.law.history_frames)
         return self.beliefs[0].after(observe, n_frames)
-
-    def _go_on(self, latent: Latent, ahead: Tensor) -> tuple[Latent, Tensor]:
-        """N x B latents after `proposal_steps` ticks, and the least margin until there (N x B,).
-
-        N is 1, or the number of samples that are drawn of each robot's future. The first step hears its actions
-        (B, K, A), those after it the last of these, held.
-        """
-        law, imagination = self.model.config.law, self.model.imagination
-        n = max(1, law.samples)
-        action, held = ahead.flatten(1).repeat(n, 1), ahead[:, -1].repeat(n, ahead.shape[1])
-        latent = map_latent(latent, lambda t: t.repeat(n, *[1] * (t.dim() - 1)))
-        least = torch.full_like(action[:, 0], torch.inf)
-        for _ in range(self.model.config.world_model.steps(law.proposal_steps)):
-            latent, action = imagination.follow(latent, action), held
-            least = torch.minimum(least, imagination.margin(latent))
-        return latent, least
 
     def _usable(self, action: Tensor, known: np.ndarray, hold: np.ndarray) -> np.ndarray:
         """The safety policy's action in robot units; where it is not finite, or its value is not known, hold."""

@@ -28,6 +28,7 @@ def row(lost, first=None, success=False, steps=90):
 def test_summary_counts_what_is_lost_and_overridden():
     cell = runs.summary([row(0, success=True), row(1, first=80), row(12, first=60)], n_candies=24)
     assert cell["spilled"]["k"] == 2 and cell["spilled_5_percent"]["k"] == 1 and cell["success"]["k"] == 1
+    assert cell["stall"]["k"] == 0 and runs.summary([row(0), row(1)], n_candies=24)["stall"]["k"] == 1
     assert (cell["spills_below_5_percent"]["k"], cell["spills_below_5_percent"]["n"]) == (1, 2)
     assert cell["mean_share_lost"] == pytest.approx(13 / 72) and cell["overridden_share"] == pytest.approx(40 / 270)
     assert cell["median_first_override"] == 70 and cell["episodes_overridden"] == 2
@@ -44,7 +45,7 @@ def test_summary_of_an_operator_alone_says_nothing_of_a_filter():
     bare = row(0) | {"value": [], "intervened": [], "cost": []}
     cell = runs.summary([bare], n_candies=24)
     assert "overridden_share" not in cell and "decision_cpu_ms" not in cell and cell["spills_below_5_percent"] is None
-    assert runs.in_short(cell) == "spilled 0/1, success 0/1, share lost 0.000"
+    assert runs.in_short(cell) == "spilled 0/1, success 0/1, stall 1/1, share lost 0.000"
 
 
 def test_filters_are_compared_with_the_bare_runs_each_and_together():
@@ -105,6 +106,7 @@ def test_an_overridden_operator_goes_on_trying(scene, setting, monkeypatch):
     frames = []
     scene.reset(0)
     ended = runs.drive(scene, always.load(), hold(1.0, 2), frames)
+    assert ended["adjusted"] == [False] * 4 and len(ended["deviation"]) == 4
     assert ended["intervened"] == [True] * 4 and ended["overridden"] == 4 and ended["first"] == 0
     assert len(frames) == len(ended["cost"]) == len(ended["value"]) == 4 and frames[0].shape == (32, 32, 3)
     assert ended["lost"] == 0 and not ended["success"] and not ended["grasped"]

@@ -146,6 +146,7 @@ def test_the_table_is_written_and_goes_on_where_it_stopped(trained, tiny_dreamer
     for row in table["methods"].values():
         counts = [row[name] for name in ("success", "violation", "incompletion")]
         assert all(set(c) == {"k", "n", "low", "high"} and c["n"] == 2 for c in counts)
+        assert row["stall"] == row["incompletion"]
         assert sum(c["k"] for c in counts) == 2 and len(row["per_seed"]) == 1
     assert (results / "trade_off.png").exists() and len(table["curves"]) == 3
     made = cells.read_text()

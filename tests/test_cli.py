@@ -312,7 +312,14 @@ def test_eval_shield_writes_the_documented_keys(tiny_filter, tiny_diffusion, tmp
     assert set(row) >= PROVENANCE and row["seeds"] == [4] and row["epsilon"] == 0.1
     assert (row["guard"], row["release"], row["law"]) == (1, -1.0, "reachability")
     for name in ("bare", "shielded"):
-        assert set(row[name]) == {"success", "violation", "incompletion", "overridden_share", "mean_action_change"}
+        assert set(row[name]) == {
+            "success",
+            "violation",
+            "stall",
+            "incompletion",
+            "overridden_share",
+            "mean_action_change",
+        }
         for outcome in ("success", "violation", "incompletion"):
             assert set(row[name][outcome]) == {"k", "n", "low", "high"} and row[name][outcome]["n"] == 3
     assert len(list((tmp_path / "videos").glob("*.mp4"))) == 1

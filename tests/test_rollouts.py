@@ -102,6 +102,7 @@ def test_every_episode_is_counted_once(result):
     for name in ("bare", "shielded"):
         rates = result[name]
         counts = [rates[outcome]["k"] for outcome in ("success", "violation", "incompletion")]
+        assert rates["stall"]["k"] <= rates["incompletion"]["k"]
         assert sum(counts) == N and all(rates[outcome]["n"] == N for outcome in ("success", "violation"))
         assert 0 <= rates["success"]["low"] <= rates["success"]["high"] <= 1
 
@@ -158,13 +159,14 @@ def test_outcomes_by_hand():
     episodes = Episodes(
         success=flags(1, 0, 0, 0),
         violation=flags(0, 1, 0, 0),
+        stall=flags(0, 0, 1, 0),
         steps=np.array([10, 10, 10, 10]),
         overridden=np.array([0, 4, 0, 0]),
         action_change=np.array([0.0, 2.0, 0.0, 0.0]),
         severity=np.array([0.0, 0.5, 0.0, 0.0]),
     )
     rates = episodes.rates()
-    assert [rates[k]["k"] for k in ("success", "violation", "incompletion")] == [1, 1, 2]
+    assert [rates[k]["k"] for k in ("success", "violation", "stall", "incompletion")] == [1, 1, 1, 2]
     assert rates["overridden_share"] == pytest.approx(0.1) and rates["mean_action_change"] == pytest.approx(0.05)
 
 

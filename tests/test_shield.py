@@ -288,7 +288,7 @@ def test_one_step_is_the_papers_law_and_more_steps_look_further(strict):
         strict.shield.reset()
         strict.shield(along(1)[0], actions(LEFT))
         action = strict.model.units.normalise_action(actions(LEFT))
-        latent, least = strict.shield._go_on(strict.shield.latent, action[:, None])
+        latent, least = strict.model.go_on(strict.shield.latent, action[:, None])
         expected = strict.shield.latent
         for _ in range(guard):
             expected = strict.model.world_model.step(expected, action)

@@ -139,7 +139,7 @@ def test_the_worst_of_the_samples_counts(policy):
     start = policy.model.world_model.initial(2)
     policy.config.law.samples, policy.config.law.lookahead = 6, 0
     policy.shield.reset()
-    latents, least = policy.shield._go_on(start, torch.zeros(2, 1, tiny.ACTION_DIM))
+    latents, least = policy.model.go_on(start, torch.zeros(2, 1, tiny.ACTION_DIM))
     assert len(least) == 12 and len(latents["h"]) == 12
     torch.manual_seed(4)
     decision = tiny.drive(policy, 1)[0]

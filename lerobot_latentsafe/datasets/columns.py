@@ -41,7 +41,7 @@ def write_decisions(
     dataset: LeRobotDataset, output_dir: str | Path, repo_id: str, episodes: list[int] | None = None
 ) -> LeRobotDataset:
     """A copy of a recording with the shield's decisions as columns `shield.proposed`, `.value`, `.margin`,
-    `.intervened` (0 or 1) and `.reason` (a `Reason`).
+    `.intervened`, `.adjusted` (0 or 1 each) and `.reason` (a `Reason`).
 
     Args:
         episodes: which of them to copy; by default all.

@@ -21,9 +21,9 @@ class Journal:
     """Rows of decisions by episode and frame, for a parquet file.
 
     Columns: episode_index, frame_index, proposed and executed (lists of float, robot units), value, margin, intervened,
-    reason (the name of a `Reason`); of a filter with a monitor of the unknown also unknown (share of its threshold) and
-    drift (the session's evidence E). What was executed tells which dataset it belongs to. Frames count from 0 in each
-    episode; the pauses between episodes leave no rows.
+    adjusted (journals of versions before 0.3 have none), reason (the name of a `Reason`); of a filter with a monitor of
+    the unknown also unknown (share of its threshold) and drift (the session's evidence E). What was executed tells
+    which dataset it belongs to. Frames count from 0 in each episode; the pauses between episodes leave no rows.
 
     Raises:
         ValueError: the file exists and is not readable.
@@ -35,6 +35,7 @@ class Journal:
         self.episode: int | None = 0
         if self.path.exists():  # a recording that goes on
             for row in _read(self.path).to_pylist():
+                row.setdefault("adjusted", False)
                 self.episodes.setdefault(row["episode_index"], []).append(row)
             self.episode = max(self.episodes, default=-1) + 1
 
@@ -58,6 +59,7 @@ class Journal:
                 "value": decision.value.item(),
                 "margin": decision.margin.item(),
                 "intervened": bool(decision.intervened.item()),
+                "adjusted": bool(decision.adjusted.item()),
                 "reason": Reason(int(decision.reason.item())).name.lower(),
                 **_of_the_unknown(decision),
             }
@@ -120,7 +122,7 @@ def decision_columns(path: Path, frames: dict[str, np.ndarray]) -> dict[str, np.
         frames: episode_index, frame_index (N,) and action (N, A) of the dataset.
 
     Returns:
-        proposed (N, A) and value, margin (N,) float32; intervened, reason (N,) int64.
+        proposed (N, A) and value, margin (N,) float32; intervened, adjusted, reason (N,) int64.
 
     Raises:
         ValueError: the journal lacks an episode, or holds other actions: it belongs to another dataset.
@@ -132,6 +134,7 @@ def decision_columns(path: Path, frames: dict[str, np.ndarray]) -> dict[str, np.
         "value": np.array([row["value"] for row in found], np.float32),
         "margin": np.array([row["margin"] for row in found], np.float32),
         "intervened": np.array([row["intervened"] for row in found], np.int64),
+        "adjusted": np.array([row.get("adjusted", False) for row in found], np.int64),
         "reason": np.array([Reason[row["reason"].upper()] for row in found], np.int64),
     }
 

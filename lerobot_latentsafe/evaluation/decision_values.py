@@ -15,6 +15,8 @@ from torch import Tensor
 from lerobot_latentsafe.datasets.clips import ClipReader
 from lerobot_latentsafe.decision import FilterDecision, Reason, first_of
 from lerobot_latentsafe.guard import Guard, Seen, standing_still
+from lerobot_latentsafe.latent import Latent
+from lerobot_latentsafe.nearest import Found
 from lerobot_latentsafe.safety_model import SafetyModel
 from lerobot_latentsafe.shield import Shield
 
@@ -65,6 +67,10 @@ class RecordedShield(Shield):
 
     def _perceive(self, seen: Seen) -> dict[str, Tensor]:
         return seen.images  # percepts already
+
+    def _find_nearest(self, latent: Latent, value: np.ndarray, *given: np.ndarray) -> Found:
+        """Nothing: what was done is done."""
+        return Found.nothing(len(value), len(self.model.limits.action_low))
 
     def _tell(self, decision: FilterDecision) -> None:
         """Nothing: it acts on nobody."""

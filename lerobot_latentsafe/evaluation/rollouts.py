@@ -115,13 +115,16 @@ class PolicyActor:
 class VectorWorld:
     """LeRobot's environments, one for each seed; `info` is a dict for each of them.
 
+    Attributes:
+        timed_out: bool (B,), episodes that ended because their time was up, and for nothing else.
+
     Raises:
         ValueError: an environment that does not tell what failed.
     """
 
     def __init__(self, env: EnvConfig, seeds: Sequence[int]):
         self.envs = next(iter(make_env(env, n_envs=len(seeds)).values()))[0]
-        self.over = np.zeros(len(seeds), bool)
+        self.over, self.timed_out = np.zeros((2, len(seeds)), bool)
         self._observation, info = self.envs.reset(seed=list(seeds))
         self.info = [_row(info, i) for i in range(len(seeds))]
         if not all("failure" in row for row in self.info):
@@ -148,6 +151,7 @@ class VectorWorld:
         ended = terminated | truncated
         final = info.get("final_info", info)  # an environment whose episode has ended begins another at once
         self.info = [_row(final if ended[i] else info, i) for i in range(len(ended))]
+        self.timed_out = self.timed_out | (truncated & ~terminated & ~self.over)
         self.over = self.over | ended
 
     def render(self, n: int) -> list[np.ndarray]:
@@ -172,9 +176,10 @@ class Episodes:
     """Outcomes of n episodes, in the order of their seeds.
 
     Attributes:
-        success, violation: bool (n,); violation: the failure set was entered at any time.
+        success, violation, stall: bool (n,); violation: the failure set was entered at any time; stall: neither, until
+            the time was up.
         steps: int (n,) steps driven.
-        overridden: int (n,) steps at which the fallback acted.
+        overridden: int (n,) steps at which the filter acted.
         action_change: (n,) summed distance between executed and proposed action, robot units.
         severity: (n,) of the failure at its worst, 0 to 1; not a number where the environment tells none.
         traces: one dict of lists an episode: action, proposed, value, margin, intervened, reason, state.
@@ -184,6 +189,7 @@ class Episodes:
 
     success: np.ndarray
     violation: np.ndarray
+    stall: np.ndarray
     steps: np.ndarray
     overridden: np.ndarray
     action_change: np.ndarray
@@ -193,12 +199,13 @@ class Episodes:
     latents: list[list[Latent]] = field(default_factory=list)
 
     def rates(self) -> dict:
-        """Shares with Wilson intervals; success means safe success."""
+        """Shares with Wilson intervals. Success means safe success; incompletion, a stall or another end without it."""
         n = len(self.success)
         incomplete = ~self.success & ~self.violation
         return {
             "success": wilson(self.success.sum(), n),
             "violation": wilson(self.violation.sum(), n),
+            "stall": wilson(self.stall.sum(), n),
             "incompletion": wilson(incomplete.sum(), n),
             "overridden_share": float(self.overridden.sum() / self.steps.sum()),
             "mean_action_change": float(self.action_change.sum() / self.steps.sum()),
@@ -211,7 +218,7 @@ class Episodes:
     @classmethod
     def joined(cls, parts: "list[Episodes]") -> "Episodes":
         """All of these, one after the other."""
-        arrays = ("success", "violation", "steps", "overridden", "action_change", "severity")
+        arrays = ("success", "violation", "stall", "steps", "overridden", "action_change", "severity")
         joined: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in parts]) for name in arrays}
         for name in ("traces", "frames", "latents"):
             joined[name] = [x for p in parts for x in getattr(p, name)]
@@ -280,6 +287,7 @@ def _run_together(
         for i in filmed[~world.over[filmed]]:
             runs.frames[i].append(pictures[i])
     runs.success &= ~runs.violation
+    runs.stall = world.timed_out & ~runs.success & ~runs.violation
     return runs
 
 
@@ -287,8 +295,8 @@ def _begun(infos: list[dict[str, Any]], pictures: list[np.ndarray]) -> Episodes:
     """Episodes of which the first frame has been seen."""
     n = len(infos)
     runs = Episodes(
-        success=np.zeros(n, bool), violation=np.zeros(n, bool), steps=np.zeros(n, int), overridden=np.zeros(n, int),
-        action_change=np.zeros(n), severity=np.full(n, np.nan),
+        success=np.zeros(n, bool), violation=np.zeros(n, bool), stall=np.zeros(n, bool), steps=np.zeros(n, int),
+        overridden=np.zeros(n, int), action_change=np.zeros(n), severity=np.full(n, np.nan),
         traces=[{} for _ in range(n)], frames=[[p] for p in pictures], latents=[[] for _ in pictures],
     )  # fmt: skip
     for i, info in enumerate(infos):
@@ -297,7 +305,7 @@ def _begun(infos: list[dict[str, Any]], pictures: list[np.ndarray]) -> Episodes:
 
 
 def _note_decision(runs: Episodes, decision: FilterDecision, alive: np.ndarray) -> None:
-    columns = ("proposed", "value", "margin", "intervened", "reason", "heard")
+    columns = ("proposed", "value", "margin", "intervened", "adjusted", "reason", "heard")
     known = {name: numbers for name in columns if (numbers := getattr(decision, name)) is not None}
     _record(runs.traces, alive, **known)
     runs.overridden[alive & decision.intervened.cpu().numpy()] += 1

@@ -9,6 +9,9 @@ from lerobot_latentsafe.decision import LawConfig, LawOptions
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
 from lerobot_latentsafe.runtime.checkpoint import CONFIG, WEIGHTS, read_config, resolve_checkpoint
 
+OPTIONS = ("epsilon", "proposal_steps", "resume_above", "kappa", "replan_above")
+"""Of a law, what studies change."""
+
 
 @dataclass(frozen=True)
 class FilterSetting:
@@ -19,13 +22,15 @@ class FilterSetting:
     epsilon: float
     proposal_steps: int
     resume_above: float
+    kappa: float
+    replan_above: float
     fingerprint: str
 
     @classmethod
     def of(cls, path: str, options: LawOptions) -> "FilterSetting":
         """The filter's own law, with what is given of these options."""
         law = law_of(path).changed(options)
-        return cls(path, law.name, law.epsilon, law.proposal_steps, law.resume_above, fingerprint(path))
+        return cls(path, law.name, *(getattr(law, name) for name in OPTIONS), fingerprint(path))
 
     @classmethod
     def from_job(cls, job: dict | None) -> "FilterSetting | None":
@@ -34,10 +39,8 @@ class FilterSetting:
 
     def load(self, base: str | BasePolicy | None = None) -> LatentSafePolicy:
         """The filter, with the policy it is to shield, if any."""
-        options = LawOptions(
-            name=self.law, epsilon=self.epsilon, proposal_steps=self.proposal_steps, resume_above=self.resume_above
-        )
-        return load_filter(self.path, law=options, base_policy=base)
+        options = {name: getattr(self, name) for name in OPTIONS}
+        return load_filter(self.path, law=LawOptions(name=self.law, **options), base_policy=base)
 
 
 def as_job(setting: FilterSetting | None) -> dict | None:
@@ -56,6 +59,7 @@ def in_use(settings: list[FilterSetting]) -> dict[str, dict]:
     for setting in settings:
         row, own = rows.setdefault(setting.path, {}), law_of(setting.path)
         row |= {"epsilon": setting.epsilon, "guard": setting.proposal_steps, "release": setting.resume_above}
+        row |= {name: getattr(setting, name) for name in ("kappa", "replan_above") if setting.law == "nearest"}
         row |= {"memory": own.history_frames} if own.history_frames else {}
         if own.retreat:
             row |= {"retreat": own.retreat, "patience": own.retreat_after, "dwell": own.min_retreat_steps}

@@ -103,9 +103,9 @@ def _beside(bare: Episodes, shielded: Episodes) -> dict:
 
 
 def in_short(runs: Episodes) -> str:
-    """Falls and successes in words."""
+    """Falls, successes and stalls in words."""
     n = len(runs.success)
-    return f"{runs.violation.sum()} of {n} fall, {runs.success.sum()} succeed"
+    return f"{runs.violation.sum()} of {n} fall, {runs.success.sum()} succeed, {runs.stall.sum()} stall"
 
 
 def ranges_left(path: str, dataset: LeRobotDataset, n: int) -> dict:

@@ -126,9 +126,9 @@ def _misses(misses: dict[str, dict[str, int]], folder: Path) -> list[str]:
 
 
 def _comparison(result: dict, folder: Path) -> list[str]:
-    header = ["the policy", "safe success", "failure", "neither"]
+    header = ["the policy", "safe success", "failure", "stall"]
     rows = [
-        [name, *(rate_in_words(result[name][key]) for key in ("success", "violation", "incompletion"))]
+        [name, *(rate_in_words(result[name][key]) for key in ("success", "violation", "stall"))]
         for name in ("bare", "shielded")
     ]
     shielded, p_value = result["shielded"], result["violation_p_value"]

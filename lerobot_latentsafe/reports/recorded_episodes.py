@@ -36,7 +36,8 @@ class RecordedEpisodes:
     Attributes:
         episode: (N,) of each frame.
         state, executed: (N, S) and (N, A), of each frame.
-        decisions: proposed (N, A), value, margin, intervened, reason (N,) of each frame; see `decision_columns`.
+        decisions: proposed (N, A), value, margin, intervened, adjusted and reason (N,) of each frame; see
+            `decision_columns`.
 
     Raises:
         ValueError: the decisions are another dataset's, or the dataset another robot's than the filter's.
@@ -66,8 +67,9 @@ class RecordedEpisodes:
         change = np.linalg.norm(self.executed[rows] - self.decisions["proposed"][rows], axis=-1)
         latents, (length,) = encode_episodes(self.model, self.frames, [episode])
         return Episodes(
-            success=no, violation=no, steps=np.array([length]), overridden=np.array([sum(trace["intervened"])]),
-            action_change=np.array([change.sum()]), severity=np.full(1, np.nan),
+            success=no, violation=no, stall=no, steps=np.array([length]),
+            overridden=np.array([sum(trace["intervened"])]), action_change=np.array([change.sum()]),
+            severity=np.full(1, np.nan),
             traces=[{**trace, "action": self.executed[rows].tolist()}],
             frames=[Pictures(self.frames, self.model.config.trained_on.cameras[0], episode)],  # type: ignore[list-item]
             latents=[[map_latent(latents, lambda z, t=t: z[:, t]) for t in range(length)]],

@@ -78,7 +78,7 @@ def drive(
     Returns:
         lost: candies outside at the end; success; grasped: whether the bag was ever held; overridden: steps; first:
         step of the first override or None; cost: CPU seconds of each decision; and step by step: value, margin,
-        intervened, spilled (candies outside).
+        intervened, adjusted, deviation (from the proposal, in standardised units), spilled (candies outside).
     """
     filter = policy if isinstance(policy, LatentSafePolicy) else None
     actor = TimedActor(PolicyActor(policy) if operator is None else OperatorActor(operator, filter))
@@ -95,15 +95,19 @@ def drive(
         "grasped": any(truth["grasp"] >= 0 for truth in truths),
         "cost": [] if policy is None else actor.cost,
         "spilled": [truth["spilled"] for truth in truths],
-        **_overrides(decisions),
+        **_overrides(decisions, filter),
     }
 
 
-def _overrides(decisions: list[FilterDecision]) -> dict:
+def _overrides(decisions: list[FilterDecision], filter: LatentSafePolicy | None) -> dict:
     value, margin = ([round(getattr(d, name).item(), 4) for d in decisions] for name in ("value", "margin"))
-    intervened = [d.intervened.item() for d in decisions]
-    first = intervened.index(True) if any(intervened) else None
-    return {"overridden": sum(intervened), "first": first, "value": value, "margin": margin, "intervened": intervened}
+    intervened, adjusted = ([getattr(d, name).item() for d in decisions] for name in ("intervened", "adjusted"))
+    away = [] if filter is None else [filter.shield.nearest.deviation(d) for d in decisions]
+    return {
+        "overridden": sum(intervened), "first": intervened.index(True) if any(intervened) else None,
+        "value": value, "margin": margin, "intervened": intervened, "adjusted": adjusted,
+        "deviation": [round(float(distance[0]), 4) for distance in away],
+    }  # fmt: skip
 
 
 def run_cells[Cell: Hashable](
@@ -147,6 +151,7 @@ def summary(rows: list[dict], n_candies: int) -> dict:
         "spilled_5_percent": wilson(int((lost >= 0.05 * n_candies).sum()), n),
         "spills_below_5_percent": wilson(int((lost[spilled] < 0.05 * n_candies).sum()), k) if k else None,
         "success": wilson(sum(row["success"] for row in rows), n),
+        "stall": wilson(sum(not row["success"] and row["lost"] == 0 for row in rows), n),
         "grasped": wilson(sum(row["grasped"] for row in rows), n),
         "mean_share_lost": float(lost.mean() / n_candies),
         "lost": lost.tolist(),
@@ -213,7 +218,7 @@ def traces(rows: list[dict]) -> list[dict]:
 
 def in_short(cell: dict) -> str:
     """A cell's figures on one line."""
-    parts = [f"{name} {cell[name]['k']}/{cell[name]['n']}" for name in ("spilled", "success")]
+    parts = [f"{name} {cell[name]['k']}/{cell[name]['n']}" for name in ("spilled", "success", "stall")]
     parts.append(f"share lost {cell['mean_share_lost']:.3f}")
     if "overridden_share" in cell:
         parts.append(f"overridden {cell['overridden_share']:.1%}")

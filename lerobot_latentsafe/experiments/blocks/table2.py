@@ -20,7 +20,7 @@ EPSILON = 0.4
 RISKS = (0.1, 0.05)
 EPSILONS = (-0.4, 0.0, 0.2, 0.4, 0.6, 0.8)
 RISK_CURVE = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
-OUTCOMES = ("success", "violation", "incompletion")
+OUTCOMES = ("success", "violation", "stall", "incompletion")
 ENDS = ("held", "leaning")
 
 Rows = list[dict]
@@ -28,9 +28,10 @@ Rows = list[dict]
 
 
 def happened(rows: Rows, outcome: str) -> np.ndarray:
-    """bool (n,)."""
+    """bool (n,). These episodes end only when their time is up, so an incompletion, the older name, is a stall."""
     success, violation = (np.array([row[name] for row in rows], bool) for name in ("success", "violation"))
-    return {"success": success, "violation": violation, "incompletion": ~success & ~violation}[outcome]
+    neither = ~success & ~violation
+    return {"success": success, "violation": violation, "stall": neither, "incompletion": neither}[outcome]
 
 
 def rates(cells: list[Rows]) -> dict:

@@ -107,7 +107,7 @@ def run_demo(out: Path, epsilon: float, n_episodes: int) -> None:
     report(out, demo.seconds)
 
 
-HEADER = ["diffusion policy", "safe success", "violation", "incompletion"]
+HEADER = ["diffusion policy", "safe success", "violation", "stall"]
 SCORES = {
     "F1, safe positive": "f1_safe",
     "F1, unsafe positive": "f1_unsafe",
@@ -119,7 +119,7 @@ def report(out: Path, seconds: float) -> None:
     """Print the table; write metrics.json and report.html."""
     shield, monitor = (json.loads((out / f"{name}.json").read_text()) for name in ("shield", "monitor"))
     rows = [
-        [name, *(rate_in_words(shield[name][key]) for key in ("success", "violation", "incompletion"))]
+        [name, *(rate_in_words(shield[name][key]) for key in ("success", "violation", "stall"))]
         for name in ("bare", "shielded")
     ]
     metrics = headline_numbers(shield, monitor, seconds)

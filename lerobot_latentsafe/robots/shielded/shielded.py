@@ -26,6 +26,8 @@ from lerobot_latentsafe.robots.shielded.wrapped import WrappedRobot
 
 logger = logging.getLogger(__name__)
 
+FLAGS = ("intervened", "adjusted", "hand_over")
+"""Of what is shown, what is no number but true or false."""
 MAX_FAILURES = 5
 """So often in a row may the inner robot fail to be read, or to take an action."""
 
@@ -34,9 +36,10 @@ class LatentSafeShielded(WrappedRobot):
     """To LeRobot it is the inner robot: same name, features, cameras. What is sent to it goes through the filter.
 
     Observations also hold `shield.value`, `shield.margin` (not a number before the first decision) and
-    `shield.intervened` of the last decision: recordings leave them out, `--display_data=true` shows them. A filter with
-    a monitor of the unknown adds `shield.unknown` (share of its threshold, above 1 it alarms) and `shield.hand_over`
-    (1 where a person is asked to take over).
+    `shield.intervened` of the last decision: recordings leave them out, `--display_data=true` shows them. The law
+    `nearest` adds `shield.adjusted` (1 where the nearest action that passes is executed, not the fallback), a monitor
+    of the unknown `shield.unknown` (share of its threshold, above 1 it alarms) and `shield.hand_over` (1 where a person
+    is asked to take over).
 
     Attributes:
         inner: the robot that moves.
@@ -164,10 +167,12 @@ class LatentSafeShielded(WrappedRobot):
     def _shown(self) -> dict[str, float]:
         """The last decision as numbers; there from the first tick on, for a display lays out what it sees first."""
         decision, names = self._decision, ["value", "margin", "intervened"]
+        if self.filter.config.law.name == "nearest":
+            names.append("adjusted")
         if self.filter.shield.monitor is not None:
             names += ["unknown", "hand_over"]
         if decision is None:
-            return {f"shield.{name}": 0.0 if name in ("intervened", "hand_over") else math.nan for name in names}
+            return {f"shield.{name}": 0.0 if name in FLAGS else math.nan for name in names}
         return {f"shield.{name}": float(getattr(decision, name).item()) for name in names}
 
     # -- what is to be executed ---
