@@ -10,7 +10,7 @@ from lerobot_latentsafe.experiments.demo import NO_GUARANTEE, SIDE_BY_SIDE, Demo
 from lerobot_latentsafe.experiments.filter_settings import law_of
 from lerobot_latentsafe.model_card import rate_in_words
 from lerobot_latentsafe.reports import html
-from lerobot_latentsafe.runtime.checkpoint import resolve_checkpoint
+from lerobot_latentsafe.runtime.locations import resolve_checkpoint
 
 OPERATORS = {"closed_end": "pulls the closed end up", "open_end": "lifts the open end"}
 
