@@ -67,11 +67,13 @@ def test_a_killed_recording_goes_on_and_equals_an_undisturbed_one(tiny, tmp_path
 
 def test_several_workers_record_the_same(tiny, tmp_path, monkeypatch):
     from multiprocessing.dummy import Pool
+    from queue import SimpleQueue
     from types import SimpleNamespace
 
     alone = columns(collect("tiny", "me/tiny", tmp_path / "alone", 2, seed=0))
     # A thread in place of processes, which would not know of the tiny source.
-    monkeypatch.setattr(collection_parts, "get_context", lambda method: SimpleNamespace(Pool=lambda workers: Pool(1)))
+    threads = SimpleNamespace(Pool=lambda workers, *start: Pool(1, *start), SimpleQueue=SimpleQueue)
+    monkeypatch.setattr(collection_parts, "get_context", lambda method: threads)
     together = columns(collect("tiny", "me/tiny", tmp_path / "together", 2, seed=0, workers=2))
     for name in COLUMNS:
         np.testing.assert_array_equal(together[name], alone[name])

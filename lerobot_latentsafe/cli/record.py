@@ -1,5 +1,6 @@
 """Verbs that record: simulated tasks in bulk, LeRobot's own loops under a filter, and what the filter decided."""
 
+import logging
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
@@ -79,6 +80,7 @@ class Collect:
             known = ", ".join([*dubins.SOURCES, *franka.SOURCES, *so101.SOURCES])
             raise ValueError(f"--source is {self.source!r}; expected one of {known}")
         new = self.dataset
+        logging.getLogger("lerobot").setLevel(logging.WARNING)  # it tells of the encoder of each part
         dataset = collect(self.source, new.repo_id, new.folder, new.num_episodes, self.seed)
         print(f"{dataset.num_episodes} episodes, {dataset.num_frames} frames in {new.folder}")
 
