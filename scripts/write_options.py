@@ -1,6 +1,7 @@
 #!/usr/bin/env python
 """Writes the options of all verbs to lerobot_latentsafe/cli/options.json, by which help comes at once."""
 
+import argparse
 import json
 from typing import Any
 
@@ -22,9 +23,17 @@ def as_json(value: Any, depth: int = 0) -> str:
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument(
+        "--check", action="store_true", help="write nothing, and fail if the file is not as it should be"
+    )
+    check = parser.parse_args().check
     register_third_party_plugins()
-    FILE.write_text(as_json(told()) + "\n", encoding="utf-8")
-    print(f"wrote {FILE.name}")
+    text = as_json(told()) + "\n"
+    if not check:
+        FILE.write_text(text, encoding="utf-8")
+    elif FILE.read_text(encoding="utf-8") != text:
+        raise SystemExit(f"{FILE.name} is not what the option classes say: run make options, and commit it")
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from lerobot_latentsafe.collection import parts as collection_parts
 from lerobot_latentsafe.collection.franka import SOURCES, Source
 from lerobot_latentsafe.collection.franka import collect_franka as collect
 from lerobot_latentsafe.collection.interventions import BRIEF, RETREATING, Interventions
+from lerobot_latentsafe.collection.quiet import quiet_recording
 from lerobot_latentsafe.datasets.labels import FailureLabels
 from lerobot_latentsafe.franka.actions import action_limits
 from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
@@ -63,6 +64,14 @@ def test_a_killed_recording_goes_on_and_equals_an_undisturbed_one(tiny, tmp_path
     dataset = LeRobotDataset("me/tiny", root=tmp_path / "whole")
     assert dataset[0]["observation.images.front"].shape == (3, 32, 32)
     assert dataset.meta.info.robot_type == "latentsafe_franka_mujoco" and dataset.num_frames == 120
+
+
+def test_a_quiet_recording_prints_nothing_of_its_videos(tiny, tmp_path, capfd, caplog):
+    quiet_recording()
+    with caplog.at_level("INFO"):
+        collect("tiny", "me/tiny", tmp_path / "quiet", 2, seed=0)
+    printed = capfd.readouterr()
+    assert "libx264" not in printed.err and "Map" not in printed.err and "codec" not in caplog.text
 
 
 def test_several_workers_record_the_same(tiny, tmp_path, monkeypatch):

@@ -178,7 +178,7 @@ def test_a_full_disk_is_told_and_finished_parts_are_kept(tmp_path, monkeypatch, 
     def full(episodes, folder):
         if episodes.start == 2:
             raise broken
-        write(episodes, folder)
+        yield from write(episodes, folder)
 
     with monkeypatch.context() as patch, pytest.raises(OSError, match=r"parts is full; finished parts are kept"):
         patch.setattr(collection.shutil, "disk_usage", lambda folder: SimpleNamespace(free=0))

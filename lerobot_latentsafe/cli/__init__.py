@@ -137,6 +137,7 @@ def overview() -> str:
 def main(argv: list[str] | None = None) -> None:
     """Entry point of the console command `latentsafe`."""
     os.environ.setdefault("MPLBACKEND", "Agg")  # pictures are written, never shown
+    os.environ.setdefault("DIFFUSERS_VERBOSITY", "error")  # it warns of parts that nobody asked for
     typed = sys.argv[1:] if argv is None else argv
     debug = "--debug" in typed
     verb, *options = [word for word in typed if word != "--debug"] or ["--help"]

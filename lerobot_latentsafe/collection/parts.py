@@ -17,6 +17,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from tqdm import tqdm
 
+from lerobot_latentsafe.collection.quiet import quiet_recording
 from lerobot_latentsafe.runtime.files import (
     claim,
     differing,
@@ -91,7 +92,7 @@ def _record_side_by_side(
     context = get_context("spawn")
     recorded = context.SimpleQueue()
     counting = Thread(target=lambda: [progress.update() for _ in iter(recorded.get, OVER)])
-    with context.Pool(workers, _tell_by, (recorded.put,)) as pool:
+    with context.Pool(workers, _begin_work, (recorded.put,)) as pool:
         counting.start()
         try:
             for _ in pool.imap(partial(_told, record), missing):
@@ -106,9 +107,10 @@ _tell: Tell | None = None
 """How a worker says that an episode is recorded."""
 
 
-def _tell_by(tell: Tell) -> None:
+def _begin_work(tell: Tell) -> None:
     global _tell
     _tell = tell
+    quiet_recording()
 
 
 def _told(record: Callable[[range], Iterator[None]], episodes: range) -> None:

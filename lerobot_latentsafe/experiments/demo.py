@@ -5,10 +5,10 @@ import runpy
 import sys
 import time
 import traceback
-from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Sequence
 from importlib.metadata import entry_points
 from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import psutil
@@ -39,9 +39,8 @@ class Demo:
         self.minutes: dict[str, float] = {}
         (out / "logs").mkdir(parents=True)
         os.environ.update(ENVIRONMENT)
-        context = get_context("forkserver")
-        context.set_forkserver_preload(list(modules))
-        self.processes = ProcessPoolExecutor(2, context, max_tasks_per_child=1)
+        self.context = get_context("forkserver")
+        self.context.set_forkserver_preload(list(modules))
 
     @property
     def seconds(self) -> float:
@@ -56,25 +55,41 @@ class Demo:
         """
         step = what.split(":")[0]
         log = self.out / "logs" / f"{step.replace(' ', '_')}.log"
+        log.touch()
         print(f"[{self.seconds:4.0f} s] {what}", flush=True)
-        succeeded, minutes = self.processes.submit(run_command, log, *command).result()
-        self.minutes[step] = self.minutes.get(step, 0.0) + minutes
-        if not succeeded:
+        answer = self._asked(run_command, log, *command)
+        self.minutes[step] = self.minutes.get(step, 0.0) + (answer or 0.0)
+        if answer is None:
             tail = "\n".join(log.read_text().splitlines()[-15:])
             raise SystemExit(f"demo: '{what}' failed; the end of {log}:\n{tail}")
 
     def finish(self) -> None:
-        """Count the time that starting took, and end all processes."""
-        server = self.processes.submit(parent_minutes).result()
-        self.minutes[STARTING] = server + _minutes()
-        self.processes.shutdown()
+        """Count the time that starting took."""
+        self.minutes[STARTING] = (self._asked(parent_minutes) or 0.0) + _minutes()
+
+    def _asked(self, function: Callable[..., float | None], *arguments: object) -> float | None:
+        """What a function answers in a process of its own; None if that process died."""
+        answer, asking = self.context.Pipe(duplex=False)
+        process = self.context.Process(target=_answer, args=(asking, function, *arguments))
+        process.start()
+        asking.close()
+        try:
+            return answer.recv()
+        except EOFError:
+            return None
+        finally:
+            process.join()
 
 
-def run_command(log: Path, *command: str) -> tuple[bool, float]:
+def _answer(asking: Connection, function: Callable[..., float | None], *arguments: object) -> None:
+    asking.send(function(*arguments))
+
+
+def run_command(log: Path, *command: str) -> float | None:
     """Run a command in this process, which it has for itself; its output is added to a log.
 
     Returns:
-        Whether it succeeded, and the minutes of CPU time that it took.
+        The minutes of CPU time that it took; None if it failed.
     """
     with log.open("a") as stream:
         for descriptor in (1, 2):
@@ -90,7 +105,7 @@ def run_command(log: Path, *command: str) -> tuple[bool, float]:
     except BaseException:  # whatever it is, the log holds it
         traceback.print_exc()
     sys.stdout.flush()
-    return succeeded, _minutes()
+    return _minutes() if succeeded else None
 
 
 def _run(program: str, *options: str) -> None:

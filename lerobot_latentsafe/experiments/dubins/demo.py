@@ -58,15 +58,15 @@ class DubinsDemo(Demo):
 
     def filter(self) -> str:
         """Collect, cache, train the world model and the safety critic, set epsilon."""
-        root = self.data("random", 300)
+        root = self.data("random", 500)
         checkpoint = self.train(
             "world model and margin", "dubins_rssm", "random", root, f"--policy.frame_cache={root}",
-            f"--policy.fallback.action_candidates={CANDIDATES}", "--steps=1100", "--policy.scheduler_steps=1100",
+            f"--policy.fallback.action_candidates={CANDIDATES}", "--steps=2000", "--policy.scheduler_steps=2000",
         )  # fmt: skip
         self.run(
             "reachability in imagination",
             *("latentsafe", "train-reachability", f"--policy.path={checkpoint}", f"--output_dir={self.out}/critic"),
-            *("--dataset.repo_id=demo/random_cache", f"--dataset.root={root}", "--steps=2000"),
+            *("--dataset.repo_id=demo/random_cache", f"--dataset.root={root}", "--steps=4000"),
         )
         return f"{self.out}/critic"
 
@@ -76,7 +76,7 @@ class DubinsDemo(Demo):
         self.run(
             "wrap",
             *("latentsafe", "wrap", f"--policy.path={critic}", f"--base_policy_path={base}"),
-            *(f"--law.epsilon={epsilon}", "--law.proposal_steps=6", f"--output_dir={out}/shielded"),
+            *(f"--law.epsilon={epsilon}", "--law.proposal_steps=9", f"--output_dir={out}/shielded"),
         )
         np.save(out / "states.npy", grid_states()[::29])  # enough for a demonstration's three digits
         self.run(
@@ -94,7 +94,7 @@ class DubinsDemo(Demo):
     def reckless(self) -> str:
         """Collect reckless demonstrations and train a diffusion policy on them."""
         root = self.data("reckless", 60)
-        return self.train("reckless diffusion policy", "dubins_diffusion", "reckless", root, "--steps=300")
+        return self.train("reckless diffusion policy", "dubins_diffusion", "reckless", root, "--steps=400")
 
 
 def run_demo(out: Path, epsilon: float, n_episodes: int) -> None:
