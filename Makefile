@@ -1,5 +1,5 @@
 # Two commands do everything on a fresh machine, set-up included: `make demo` and `make test`.
-.PHONY: setup demo demo-bag test lint docs pages reliability platforms results
+.PHONY: setup demo demo-bag test lint docs pages options reliability platforms results
 
 PYTHON = .venv/bin/python
 # Tests and commands start many processes: without kept bytecode each would compile all that it imports.
@@ -44,6 +44,10 @@ docs: setup
 # The pages as they are, half a minute: do all references lead somewhere?
 pages: setup
 	$(SPHINX) -D nb_execution_mode=off -D suppress_warnings=myst-nb.lexer docs docs/_build/pages
+
+# lerobot_latentsafe/cli/options.json, by the option classes: after a change of any option.
+options: setup
+	$(PYTHON) scripts/write_options.py
 
 # docs/reliability.md, by the tests of all faults.
 reliability: setup

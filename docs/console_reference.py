@@ -9,21 +9,16 @@ import inspect
 import re
 import typing
 from collections.abc import Iterator
-from dataclasses import MISSING, is_dataclass, replace
+from dataclasses import MISSING
 
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_latentsafe.cli import GROUPS, VERBS
-from lerobot_latentsafe.cli.command_line import Option, options_of
+from lerobot_latentsafe.cli.option_classes import Option, options_class, options_of
 
 VERBS_HERE, OPTIONS_HERE = "<!-- console-reference -->", re.compile(r"<!-- options: ([\w.]+)\.(\w+) -->")
 LEROBOTS = {"RecordConfig": "lerobot-record", "TeleoperateConfig": "lerobot-teleoperate"}
 """Option classes of LeRobot that verbs extend, and the command that has the same options."""
-
-
-def options_class(verb: str) -> type:
-    """The option class of a verb of `latentsafe`."""
-    return getattr(importlib.import_module(VERBS[verb].module), VERBS[verb].name)
 
 
 def own_options(options: type) -> list[Option]:
@@ -35,12 +30,6 @@ def _origin(options: type, option: Option) -> str:
     """The module of the class that brings an option, or its group."""
     first = option.name.partition(".")[0]
     return next(kind.__module__ for kind in options.__mro__ if first in inspect.get_annotations(kind))
-
-
-def meaning(option: Option) -> str:
-    """What the code says of an option, in its class or in one that this extends."""
-    texts = (replace(option, owner=kind).text for kind in option.owner.__mro__ if is_dataclass(kind))
-    return next(filter(None, texts), "")
 
 
 def console_reference() -> str:
@@ -68,7 +57,7 @@ def class_reference(options: type) -> str:
 
 def _table(options: list[Option], dashes: str) -> str:
     rows = [
-        f"| `{dashes}{option.name}` | {_kind(option)} | {_default(option)} | {_escaped(meaning(option))} |"
+        f"| `{dashes}{option.name}` | {_kind(option)} | {_default(option)} | {_escaped(option.text)} |"
         for option in options
     ]
     return "\n".join(["| Option | Value | Default | Meaning |", "|---|---|---|---|", *rows]) + "\n" if rows else ""
@@ -86,8 +75,6 @@ def _kind(option: Option) -> str:
 def _default(option: Option) -> str:
     if option.default is MISSING:
         return "must be given"
-    if option.name == "user":
-        return "your name here"
     plain = isinstance(option.default, str | int | float | list | dict | tuple) or hasattr(option.default, "parts")
     shown = str(option.default).lower() if isinstance(option.default, bool) else str(option.default)
     return f"`{shown}`" if plain and shown not in ("", "[]", "{}") and "<" not in shown else ""

@@ -21,6 +21,7 @@ from lerobot.policies.utils import prepare_observation_for_inference
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.scripts.lerobot_train import train
 
+import lerobot_latentsafe.registration  # noqa: F401  (environments are looked up by name)
 from lerobot_latentsafe._compat import quiet_decoder
 from lerobot_latentsafe.base_policy import BasePolicy
 from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
@@ -34,7 +35,7 @@ from lerobot_latentsafe.evaluation.along_episodes import values_along as model_v
 from lerobot_latentsafe.evaluation.rollouts import compare
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
 from lerobot_latentsafe.reports.figures import write_videos
-from lerobot_latentsafe.runtime.checkpoint import resolve_checkpoint
+from lerobot_latentsafe.runtime.locations import resolve_checkpoint
 from lerobot_latentsafe.runtime.processors import load_processors
 from lerobot_latentsafe.training import train_reachability
 

@@ -18,17 +18,8 @@ from torch import Tensor
 from lerobot_latentsafe._compat import ADAPTER, forget_plan, is_lerobots, merged_adapter, queued_actions
 from lerobot_latentsafe.action_chunks import ChunksAhead
 from lerobot_latentsafe.origin import Origin, inverse, order
-from lerobot_latentsafe.runtime.checkpoint import (
-    BASE_FOLDER,
-    CONFIG,
-    WEIGHTS,
-    CheckpointError,
-    inside,
-    named_by,
-    read_config,
-    read_json,
-    resolve_checkpoint,
-)
+from lerobot_latentsafe.runtime.checkpoint import BASE_FOLDER, WEIGHTS, read_config, read_json
+from lerobot_latentsafe.runtime.locations import CONFIG, CheckpointError, inside, named_by, resolve_checkpoint
 from lerobot_latentsafe.runtime.processors import DownloadedCodeError, load_processors, no_downloaded_code
 
 logger = logging.getLogger(__name__)

@@ -18,7 +18,8 @@ from lerobot_latentsafe.decision import Reason
 from lerobot_latentsafe.guard import check_plan
 from lerobot_latentsafe.host import on_host
 from lerobot_latentsafe.limits import Limits, differs
-from lerobot_latentsafe.runtime.checkpoint import read_config, resolve_checkpoint
+from lerobot_latentsafe.runtime.checkpoint import read_config
+from lerobot_latentsafe.runtime.locations import resolve_checkpoint
 from lerobot_latentsafe.units import TrainedOn, Units
 
 logger = logging.getLogger(__name__)

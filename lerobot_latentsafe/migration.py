@@ -8,16 +8,9 @@ from typing import Any
 from safetensors.torch import load_file, save_file
 
 from lerobot_latentsafe.configuration_latentsafe import SEALED, SEALED_ENTRIES
-from lerobot_latentsafe.runtime.checkpoint import (
-    CONFIG,
-    INTEGRITY,
-    WEIGHTS,
-    CheckpointError,
-    check_sealed,
-    read_json,
-    seal,
-)
+from lerobot_latentsafe.runtime.checkpoint import INTEGRITY, WEIGHTS, check_sealed, read_json, seal
 from lerobot_latentsafe.runtime.files import refuse_existing, replacing_folder
+from lerobot_latentsafe.runtime.locations import CONFIG, CheckpointError
 
 MOVED = {
     **{f"margin_{name}": ("margin", name) for name in ("hidden", "layers", "delta", "weight", "clips")},

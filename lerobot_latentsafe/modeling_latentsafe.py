@@ -34,16 +34,15 @@ from lerobot_latentsafe.host import on_host
 from lerobot_latentsafe.model_card import make_model_card
 from lerobot_latentsafe.runtime.checkpoint import (
     BASE_FOLDER,
-    CheckpointError,
     check_in_use,
     check_sealed,
     fitting_weights,
     read_config,
-    resolve_checkpoint,
     seal,
     weights_digest,
     writing_checkpoint,
 )
+from lerobot_latentsafe.runtime.locations import CheckpointError, resolve_checkpoint
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
 from lerobot_latentsafe.runtime.processors import check_own_processors
 from lerobot_latentsafe.runtime.time_limit import TimeLimit

@@ -14,7 +14,8 @@ from huggingface_hub.utils import HFValidationError, validate_repo_id
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME, HF_LEROBOT_HUB_CACHE, OBS_STATE
 
-from lerobot_latentsafe.runtime.checkpoint import CheckpointError, is_downloaded, read_json
+from lerobot_latentsafe.runtime.checkpoint import read_json
+from lerobot_latentsafe.runtime.locations import CheckpointError, is_downloaded
 
 FILE = "trained_on.json"
 """What is known of a policy's origin, in its folder; a person may write it. It counts more than everything else."""

@@ -22,10 +22,11 @@ from lerobot_latentsafe.latent import Latent, map_latent, select
 from lerobot_latentsafe.margin import FailureMargin, hinge_loss
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
 from lerobot_latentsafe.reachability import LatentReachability, Starts
-from lerobot_latentsafe.runtime.checkpoint import CONFIG, CheckpointError, read_config, weights_digest
+from lerobot_latentsafe.runtime.checkpoint import read_config, weights_digest
 from lerobot_latentsafe.runtime.distributed import gathered, rank, share
 from lerobot_latentsafe.runtime.files import claim, differing, refuse_existing, replacing_folder
 from lerobot_latentsafe.runtime.hub import save_policy
+from lerobot_latentsafe.runtime.locations import CONFIG, CheckpointError
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
 from lerobot_latentsafe.runtime.options import require_at_least
 from lerobot_latentsafe.safety_model import SafetyModel

@@ -19,7 +19,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot_latentsafe.datasets.adoption import with_limits
 from lerobot_latentsafe.datasets.contract import Contract
 from lerobot_latentsafe.datasets.live_cameras import looks_of
-from lerobot_latentsafe.runtime.checkpoint import CONFIG, PRETRAINED, read_config, seal_again
+from lerobot_latentsafe.runtime.checkpoint import read_config, seal_again
+from lerobot_latentsafe.runtime.locations import CONFIG, PRETRAINED
 
 RECORDINGS = {
     "dubins": ["car", "car_more"],

@@ -19,7 +19,7 @@ from lerobot_latentsafe.cli import main as latentsafe
 from lerobot_latentsafe.encoders.patch_encoders import EncoderError, load_encoder
 from lerobot_latentsafe.evaluation.rollouts import PolicyActor
 from lerobot_latentsafe.experiments.bag import demo, demo_filter, out_of_distribution, policies, runs
-from lerobot_latentsafe.experiments.demo import Demo
+from lerobot_latentsafe.experiments.demo import STARTING, Demo, where_the_minutes_went
 from lerobot_latentsafe.experiments.scene_world import OperatorActor, SceneWorld
 from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES, action_limits
 from lerobot_latentsafe.franka.bag import BagScene
@@ -103,13 +103,13 @@ def test_policies_are_compared_operators_traced_and_the_demo_tells(script, filte
     traces = json.loads((tmp_path / "closed_end.json").read_text())["closed_end"]["traces"]
     assert len(traces) == 1 and len(traces[0]["value"]) == STEPS
 
-    demo.report(tmp_path, "margin", 90.0)
+    demo.report(tmp_path, "margin", 90.0, {"policies": 1.25, "closed_end": 0.5})
     page, numbers = (tmp_path / "report.html").read_text(), json.loads((tmp_path / "metrics.json").read_text())
     assert page.count("<video") == 1 and page.count("<img") == 3 + PRINTED and "0/2 = 0.0%" in page
     assert numbers["the same, shielded"]["overridden_share"] == 1.0 and "1.5 minutes" in capsys.readouterr().out
     for file in (table, table.with_suffix(".png"), *tmp_path.glob("videos/*.mp4")):  # without a policy
         file.unlink()
-    demo.report(tmp_path, "margin", 90.0)
+    demo.report(tmp_path, "margin", 90.0, {"policies": 1.25, "closed_end": 0.5})
     assert (tmp_path / "report.html").read_text().count("<img") == 2
 
 
@@ -177,14 +177,24 @@ def test_the_demo_records_nothing_for_an_encoder_that_cannot_see(script, tmp_pat
     assert not (tmp_path / "demo").exists()
 
 
-def test_a_command_that_fails_shows_the_end_of_its_log(tmp_path, capsys):
+def test_a_demo_logs_each_command_and_counts_its_minutes(tmp_path, capsys):
     shown = Demo(tmp_path / "demo")
-    shown.run("greet: once", "python", "-c", "print('hello')")
-    assert (
-        "hello" in (tmp_path / "demo" / "logs" / "greet.log").read_text() and "greet: once" in capsys.readouterr().out
-    )
-    with pytest.raises(SystemExit, match=r"(?s)'break' failed.*ZeroDivisionError"):
-        shown.run("break", "python", "-c", "1 / 0")
+    shown.run("where: is the bag?", "latentsafe", "path", "--name=bag")
+    assert "pretrained/bag" in (tmp_path / "demo" / "logs" / "where.log").read_text()
+    assert "where: is the bag?" in capsys.readouterr().out
+    broken = tmp_path / "broken.py"
+    broken.write_text("1 / 0")
+    for command, words in (
+        (("latentsafe", "path", "--name=x"), "no checkpoint at x"),
+        (("python", str(broken)), "Zero"),
+    ):
+        with pytest.raises(SystemExit, match=f"(?s)'break' failed.*{words}"):
+            shown.run("break", *command)
+    shown.finish()
+    assert list(shown.minutes) == ["where", "break", STARTING]
+    assert shown.minutes["where"] > 0 and shown.minutes[STARTING] > 0
+    part = "".join(where_the_minutes_went({"cache": 0.25, "train": 2.0}))
+    assert part.index("train") < part.index("cache") and "2.2" in part
 
 
 def test_a_simulation_waits_for_whoever_decides_in_it(filter_path):

@@ -18,8 +18,8 @@ from lerobot_latentsafe._compat import observation_queues, queued_actions
 from lerobot_latentsafe.base_policy import BasePolicy
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.origin import FILE, Origin
-from lerobot_latentsafe.runtime.checkpoint import CheckpointError
 from lerobot_latentsafe.runtime.hub import save_policy
+from lerobot_latentsafe.runtime.locations import CheckpointError
 
 NO_CHUNKS = {
     "act, averaged": "makes no chunks", "gaussian_actor": "makes no chunks", "tdmpc, repeated": "plans 1 actions",

@@ -21,7 +21,8 @@ from lerobot_latentsafe.calibration import (
 )
 from lerobot_latentsafe.cli import main, train
 from lerobot_latentsafe.cli.deploy import Wrap
-from lerobot_latentsafe.cli.options import DatasetSource, PolicySource
+from lerobot_latentsafe.cli.options import DatasetSource
+from lerobot_latentsafe.cli.places import PolicySource
 from lerobot_latentsafe.cli.train import Calibrate
 from lerobot_latentsafe.collection.dubins import collect_dubins
 from lerobot_latentsafe.datasets.build_cache import build_frame_cache

@@ -2,8 +2,6 @@ import importlib
 import json
 import shlex
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,16 +10,14 @@ import tiny
 import torch
 
 from lerobot_latentsafe.cli import GROUPS, VERBS, main
-from lerobot_latentsafe.cli.command_line import parsed, renamed
-from lerobot_latentsafe.cli.deploy import Wrap
+from lerobot_latentsafe.cli.command_line import described, parsed, renamed
 from lerobot_latentsafe.cli.evaluate import DrawFeatures
-from lerobot_latentsafe.cli.record import Record
 from lerobot_latentsafe.datasets.frame_cache import FrameCache
 from lerobot_latentsafe.datasets.labels import read_frames
 from lerobot_latentsafe.decision import LawOptions
 from lerobot_latentsafe.dubins.ground_truth import exact_value
 from lerobot_latentsafe.labeling.store import LabelStore
-from lerobot_latentsafe.runtime import checkpoint
+from lerobot_latentsafe.runtime import locations
 
 PROVENANCE = {"command", "commit", "seeds", "cpu_minutes", "machine", "date"}
 
@@ -167,26 +163,23 @@ def test_values_may_stand_apart(capsys):
     ],
 )
 def test_old_options_are_understood_with_a_warning(caplog, verb, old, new):
-    entry = VERBS[verb]
-    options = getattr(importlib.import_module(entry.module), entry.name)
-    chosen = {"record": "robot", "train-dreamer": "model"}.get(verb)
-    kind = {"robot": "latentsafe_shielded", "model": "latentsafe"}.get(chosen)
-    given = [(f"{chosen}.type", kind)] if chosen else []
+    chosen = {"record": ("robot.type", "latentsafe_shielded"), "train-dreamer": ("model.type", "latentsafe")}.get(verb)
+    given = [chosen] if chosen else []
     name, _, value = old.removeprefix("--").partition("=")
-    assert renamed(verb, options, [*given, (name, value)])[-1] == (new, value)
+    assert renamed(described(verb, dict(given)), [*given, (name, value)])[-1] == (new, value)
     assert f"--{name} is now --{new}" in caplog.text
 
 
 def test_a_law_may_be_given_as_a_whole_or_by_its_old_name():
     for law in ("--law=plan", "--law.name=plan", "--law={name: plan}"):
-        parsed_law = parsed("wrap", Wrap, ["--policy.path=x", "--output_dir=y", law]).law
+        parsed_law = parsed("wrap", ["--policy.path=x", "--output_dir=y", law]).law
         assert parsed_law == LawOptions(name="plan")
 
 
 def test_an_option_of_another_robot_is_not_renamed():
     """The old `--robot.mode` of a shielded robot; a robot may have an option of that name."""
     given = [("robot.type", "latentsafe_franka"), ("robot.monitor", "true")]
-    assert renamed("record", Record, given) == given
+    assert renamed(described("record", dict(given)), given) == given
 
 
 def test_picture_features_is_now_draw_features(monkeypatch, caplog):
@@ -195,25 +188,8 @@ def test_picture_features_is_now_draw_features(monkeypatch, caplog):
     assert "latentsafe picture-features is now latentsafe draw-features" in caplog.text
 
 
-LIGHT = """
-import sys, types
-package = types.ModuleType("lerobot_latentsafe")  # what the package itself imports does not count here
-package.__path__ = [sys.argv[1]]
-sys.modules["lerobot_latentsafe"] = package
-import lerobot_latentsafe.cli as cli
-cli.main(["--help"])
-print(sorted({"torch", "lerobot", "draccus", "numpy"} & set(sys.modules)))
-"""
-
-
-def test_the_console_command_itself_is_light():
-    folder = Path(importlib.import_module("lerobot_latentsafe").__file__).parent
-    done = subprocess.run([sys.executable, "-c", LIGHT, folder], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1] == "[]"
-
-
 def test_path_prints_a_committed_checkpoint(capsys, tmp_path, monkeypatch):
-    monkeypatch.setattr(checkpoint, "PRETRAINED", tmp_path)
+    monkeypatch.setattr(locations, "PRETRAINED", tmp_path)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "config.json").write_text("{}")
     main(["path", "--name=mine"])

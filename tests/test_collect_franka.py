@@ -11,6 +11,7 @@ from lerobot_latentsafe.collection import parts as collection_parts
 from lerobot_latentsafe.collection.franka import SOURCES, Source
 from lerobot_latentsafe.collection.franka import collect_franka as collect
 from lerobot_latentsafe.collection.interventions import BRIEF, RETREATING, Interventions
+from lerobot_latentsafe.collection.quiet import quiet_recording
 from lerobot_latentsafe.datasets.labels import FailureLabels
 from lerobot_latentsafe.franka.actions import action_limits
 from lerobot_latentsafe.franka.bag import VARIANTS, Variant
@@ -66,13 +67,23 @@ def test_a_killed_recording_goes_on_and_equals_an_undisturbed_one(tiny, tmp_path
     assert dataset.meta.info.robot_type == "latentsafe_franka_mujoco" and dataset.num_frames == 120
 
 
+def test_a_quiet_recording_prints_nothing_of_its_videos(tiny, tmp_path, capfd, caplog):
+    quiet_recording()
+    with caplog.at_level("INFO"):
+        collect("tiny", "me/tiny", tmp_path / "quiet", 2, seed=0)
+    printed = capfd.readouterr()
+    assert "libx264" not in printed.err and "Map" not in printed.err and "codec" not in caplog.text
+
+
 def test_several_workers_record_the_same(tiny, tmp_path, monkeypatch):
     from multiprocessing.dummy import Pool
+    from queue import SimpleQueue
     from types import SimpleNamespace
 
     alone = columns(collect("tiny", "me/tiny", tmp_path / "alone", 2, seed=0))
     # A thread in place of processes, which would not know of the tiny source.
-    monkeypatch.setattr(collection_parts, "get_context", lambda method: SimpleNamespace(Pool=lambda workers: Pool(1)))
+    threads = SimpleNamespace(Pool=lambda workers, *start: Pool(1, *start), SimpleQueue=SimpleQueue)
+    monkeypatch.setattr(collection_parts, "get_context", lambda method: threads)
     together = columns(collect("tiny", "me/tiny", tmp_path / "together", 2, seed=0, workers=2))
     for name in COLUMNS:
         np.testing.assert_array_equal(together[name], alone[name])

@@ -16,7 +16,7 @@ from test_hub import hub  # noqa: F401
 
 from lerobot_latentsafe.base_policy import BasePolicy
 from lerobot_latentsafe.cli.deploy import Push
-from lerobot_latentsafe.cli.options import PolicySource
+from lerobot_latentsafe.cli.places import PolicySource
 from lerobot_latentsafe.decision import LawOptions
 from lerobot_latentsafe.experiments.blocks import dreamer_training, recorders
 from lerobot_latentsafe.experiments.blocks.dreamer_training import DreamerTraining, TrainDreamer
@@ -25,9 +25,9 @@ from lerobot_latentsafe.experiments.blocks.study import world_model_of
 from lerobot_latentsafe.franka.actions import STATE_NAMES, action_limits
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
 from lerobot_latentsafe.policies.dreamer.modeling_dreamer import LatentSafeDreamerPolicy, WorldModelMismatchError
-from lerobot_latentsafe.runtime.checkpoint import CheckpointError
 from lerobot_latentsafe.runtime.files import FolderInUseError, OtherRunError
 from lerobot_latentsafe.runtime.hub import halve_weights
+from lerobot_latentsafe.runtime.locations import CheckpointError
 from lerobot_latentsafe.safety_model import UntrainedFilterError
 from lerobot_latentsafe.training import train_reachability
 

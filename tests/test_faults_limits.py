@@ -7,7 +7,7 @@ import pytest
 from faulty import row
 
 from lerobot_latentsafe.modeling_latentsafe import load_filter
-from lerobot_latentsafe.runtime.checkpoint import CheckpointError
+from lerobot_latentsafe.runtime.locations import CheckpointError
 
 DOCS = Path(__file__).parents[1] / "docs"
 SEAL, ARM, LIMITS = ("deploying.md", "Deploying"), ("franka.md", "The real Franka"), ("limits.md", "Known limits")

@@ -21,7 +21,7 @@ from lerobot_latentsafe.configuration_latentsafe import SEALED
 from lerobot_latentsafe.decision import Reason
 from lerobot_latentsafe.guard import UnknownPoseError
 from lerobot_latentsafe.modeling_latentsafe import load_filter
-from lerobot_latentsafe.runtime.checkpoint import CheckpointError
+from lerobot_latentsafe.runtime.locations import CheckpointError
 
 OUTCOMES: Counter[str] = Counter()
 """What came of the examples, for `scripts/fuzz.py`."""

@@ -9,8 +9,8 @@ from huggingface_hub import ModelCard, constants
 from lerobot_latentsafe.decision import LawOptions
 from lerobot_latentsafe.experiments.kills.hub_stub import Hub
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
-from lerobot_latentsafe.runtime.checkpoint import CheckpointError
 from lerobot_latentsafe.runtime.hub import HubUnreachableError, push_policy, save_policy
+from lerobot_latentsafe.runtime.locations import CheckpointError
 
 
 def point_to(monkeypatch, hub, cache):

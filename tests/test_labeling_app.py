@@ -19,7 +19,8 @@ from starlette.testclient import TestClient
 
 from lerobot_latentsafe.datasets.episodes import DatasetFrames
 from lerobot_latentsafe.labeling import app as app_module
-from lerobot_latentsafe.labeling.app import LabelServer, listen
+from lerobot_latentsafe.labeling.app import LabelServer
+from lerobot_latentsafe.labeling.listening import address_of, listen
 from lerobot_latentsafe.labeling.store import LabelStore
 
 TOKEN, HOST = "right-token", "http://127.0.0.1:8765"
@@ -260,7 +261,7 @@ def test_an_address_beyond_loopback_is_spelled_out(monkeypatch):
     for host in ("somewhere.example", "0xc0.0.2.7", "192.0.519"):
         with pytest.raises(ValueError, match=r"stands for 192\.0\.2\.7, which others can reach.*--host=192\.0\.2\.7"):
             listen(host, 0)
-    assert str(app_module.address_of("192.0.2.7")) == "192.0.2.7"
+    assert str(address_of("192.0.2.7")) == "192.0.2.7"
 
 
 @pytest.mark.parametrize("host", ["not.a.host.invalid", "a" * 300, "a\0b", "*", "127.0.0.1:80"])

@@ -14,8 +14,8 @@ from lerobot_latentsafe.base_policy import BasePolicy
 from lerobot_latentsafe.cli import main
 from lerobot_latentsafe.migration import MOVED, SEALED_WHEN_FLAT, migrate_checkpoint
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
-from lerobot_latentsafe.runtime import checkpoint
-from lerobot_latentsafe.runtime.checkpoint import CheckpointError
+from lerobot_latentsafe.runtime import checkpoint, locations
+from lerobot_latentsafe.runtime.locations import CheckpointError
 from lerobot_latentsafe.units import TrainedOn
 
 COMMAND = "latentsafe migrate-checkpoint --policy.path="
@@ -171,7 +171,7 @@ def test_what_lies_in_a_checkpoint_comes_along(tiny_filter, tiny_diffusion, tmp_
 
 
 def test_a_committed_name_can_be_migrated(old, tiny_filter, tmp_path, monkeypatch):
-    monkeypatch.setattr(checkpoint, "PRETRAINED", old.parent)
+    monkeypatch.setattr(locations, "PRETRAINED", old.parent)
     main(["migrate-checkpoint", "--policy.path=old", f"--output_dir={tmp_path / 'new'}"])
     assert_same(tmp_path / "new", tiny_filter)
 

@@ -7,7 +7,8 @@ import pytest
 import tiny
 
 from lerobot_latentsafe.cli.evaluate import ExplainMisses
-from lerobot_latentsafe.cli.options import DatasetSource, PolicySource
+from lerobot_latentsafe.cli.options import DatasetSource
+from lerobot_latentsafe.cli.places import PolicySource
 from lerobot_latentsafe.datasets.labels import FAILING
 from lerobot_latentsafe.decision import LawOptions
 from lerobot_latentsafe.evaluation import misses

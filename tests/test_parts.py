@@ -5,6 +5,8 @@ import json
 import os
 import threading
 from functools import partial
+from multiprocessing.pool import ThreadPool
+from queue import SimpleQueue
 from types import SimpleNamespace
 
 import numpy as np
@@ -27,6 +29,7 @@ class Killed(BaseException):
     pass
 
 
+THREADS = SimpleNamespace(Pool=ThreadPool, SimpleQueue=SimpleQueue)
 ALONE = threading.RLock()
 """Threads stand in for processes here, and imports that fail, as LeRobot's of torchcodec may, are theirs in common."""
 
@@ -34,7 +37,7 @@ ALONE = threading.RLock()
 def write(episodes, folder, recorded=None):
     """Episode i has i % 3 + 2 frames that hold its number."""
     with ALONE:
-        _write(episodes, folder, recorded)
+        yield from _write(episodes, folder, recorded)
 
 
 def _write(episodes, folder, recorded):
@@ -46,6 +49,7 @@ def _write(episodes, folder, recorded):
         dataset.save_episode()
         if recorded is not None:
             recorded.append(i)
+        yield
     dataset.finalize()
 
 
@@ -128,7 +132,7 @@ def test_finished_parts_serve_another_number_of_episodes_or_workers(tmp_path, mo
         killed_at(patch, collection, "_record_part", 2)  # 0 to 3 are there
         record(tmp_path / "cut")
     recorded = []
-    monkeypatch.setattr(collection, "get_context", lambda method: __import__("multiprocessing.dummy").dummy)
+    monkeypatch.setattr(collection, "get_context", lambda method: THREADS)
     resumed = record(tmp_path / "cut", n, partial(write, recorded=recorded), workers=workers)
     assert sorted(recorded) == list(range(4, n)) and resumed.num_episodes == n
     assert content(resumed)["observation.state"][:, 0].tolist() == [i for i in range(n) for _ in range(i % 3 + 2)]
@@ -174,7 +178,7 @@ def test_a_full_disk_is_told_and_finished_parts_are_kept(tmp_path, monkeypatch, 
     def full(episodes, folder):
         if episodes.start == 2:
             raise broken
-        write(episodes, folder)
+        yield from write(episodes, folder)
 
     with monkeypatch.context() as patch, pytest.raises(OSError, match=r"parts is full; finished parts are kept"):
         patch.setattr(collection.shutil, "disk_usage", lambda folder: SimpleNamespace(free=0))
@@ -214,3 +218,41 @@ def test_the_note_says_what_the_parts_are_of(tmp_path, monkeypatch):
         killed_at(patch, collection, "_put_together", 0)
         record(tmp_path / "cut")
     assert json.loads((tmp_path / "cut.parts" / "options.json").read_text()) == OPTIONS
+
+
+class Steps:
+    """In place of tqdm: what the bar is told."""
+
+    def __init__(self, total, **_):
+        self.total, self.steps = total, []
+
+    def __enter__(self):
+        bars.append(self)
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+    def update(self, n=1):
+        self.steps.append(n)
+
+
+bars: list[Steps] = []
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_the_bar_takes_a_step_an_episode(tmp_path, monkeypatch, workers):
+    monkeypatch.setattr(collection, "tqdm", Steps)
+    monkeypatch.setattr(collection, "get_context", lambda method: THREADS)
+    record(tmp_path / "whole", workers=workers)
+    assert (bars[-1].total, bars[-1].steps) == (N, [1] * N)
+
+
+def test_an_error_of_a_worker_is_raised(tmp_path, monkeypatch):
+    def broken(episodes, folder):
+        yield from write(episodes, folder)
+        raise ValueError("the arm came off")
+
+    monkeypatch.setattr(collection, "get_context", lambda method: THREADS)
+    with pytest.raises(ValueError, match="the arm came off"):
+        record(tmp_path / "whole", record=broken, workers=2)

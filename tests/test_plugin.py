@@ -80,9 +80,10 @@ def test_wheel_is_named_as_lerobot_looks_for_it(wheel):
 def test_wheel_holds_every_module_and_checkpoint(installed):
     package = REPOSITORY / "lerobot_latentsafe"
     folders = ("pretrained", "franka/assets", "labeling/page")
+    files = [package / "cli" / "options.json"]
     data = {folder: [f for f in (package / folder).rglob("*") if f.is_file()] for folder in folders}
     assert all(data.values())
-    wanted = [*package.rglob("*.py"), *(f for files in data.values() for f in files)]
+    wanted = [*package.rglob("*.py"), *files, *(f for files in data.values() for f in files)]
     missing = [f.relative_to(REPOSITORY) for f in wanted if not (installed / f.relative_to(REPOSITORY)).exists()]
     assert [f for f in missing if f.parts[1] != "_plugin"] == []
     assert (installed / "lerobot_policy_latentsafe" / "__init__.py").exists()

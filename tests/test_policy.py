@@ -19,8 +19,9 @@ from lerobot_latentsafe.datasets.adoption import adopt_dataset
 from lerobot_latentsafe.datasets.contract import Contract
 from lerobot_latentsafe.decision import Reason
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, UntrainedFilterError, adopt
-from lerobot_latentsafe.runtime.checkpoint import CheckpointError, resolve_checkpoint, seal
+from lerobot_latentsafe.runtime.checkpoint import seal
 from lerobot_latentsafe.runtime.hub import save_policy
+from lerobot_latentsafe.runtime.locations import CheckpointError, resolve_checkpoint
 from lerobot_latentsafe.training import train_reachability
 
 load = LatentSafePolicy.from_pretrained
@@ -158,7 +159,7 @@ def test_no_path_at_all_asks_for_one():
 
 
 def test_names_resolve_to_committed_folders(tmp_path, monkeypatch):
-    monkeypatch.setattr("lerobot_latentsafe.runtime.checkpoint.PRETRAINED", tmp_path)
+    monkeypatch.setattr("lerobot_latentsafe.runtime.locations.PRETRAINED", tmp_path)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "config.json").write_text("{}")
     assert resolve_checkpoint("mine") == tmp_path / "mine"

@@ -8,7 +8,7 @@ from lerobot_latentsafe.dubins.ground_truth import exact_value
 from lerobot_latentsafe.evaluation.statistics import confusion
 from lerobot_latentsafe.experiments.dubins.monitor import LatentMonitor
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
-from lerobot_latentsafe.runtime.checkpoint import PRETRAINED, committed_names
+from lerobot_latentsafe.runtime.locations import PRETRAINED, committed_names
 
 
 def size_of(name):

@@ -18,9 +18,10 @@ from lerobot_latentsafe import LatentSafeDubinsEnv
 from lerobot_latentsafe.base_policy import BasePolicy
 from lerobot_latentsafe.configuration_latentsafe import SEALED, SEALED_ENTRIES
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
-from lerobot_latentsafe.runtime import checkpoint, processors
-from lerobot_latentsafe.runtime.checkpoint import CheckpointError, CheckpointWriteError, read_config, seal
+from lerobot_latentsafe.runtime import checkpoint, locations, processors
+from lerobot_latentsafe.runtime.checkpoint import CheckpointWriteError, read_config, seal
 from lerobot_latentsafe.runtime.hub import save_policy
+from lerobot_latentsafe.runtime.locations import CheckpointError
 from lerobot_latentsafe.runtime.processors import DownloadedCodeError, load_processors, no_downloaded_code
 
 DEEP = "[" * 100_000 + "]" * 100_000
@@ -261,8 +262,8 @@ def test_a_seal_that_covers_less_than_ever_is_no_seal(filter_copy, entries):
 
 @pytest.mark.parametrize("name", ["dubins", "bag", "blocks"])
 def test_committed_filters_are_sealed_in_all_that_decides(name):
-    checkpoint.check_sealed(checkpoint.PRETRAINED / name, SEALED_ENTRIES)
-    record = json.loads((checkpoint.PRETRAINED / name / "integrity.json").read_text())
+    checkpoint.check_sealed(locations.PRETRAINED / name, SEALED_ENTRIES)
+    record = json.loads((locations.PRETRAINED / name / "integrity.json").read_text())
     assert {"policy_preprocessor.json", "policy_postprocessor.json"} <= record["files"].keys()
 
 
@@ -402,7 +403,7 @@ def nothing_fetched(monkeypatch):
         assert options.get("local_files_only"), "the Hub was asked"
         raise OSError("not in the cache")
 
-    monkeypatch.setattr(checkpoint, "snapshot_download", fetch)
+    monkeypatch.setattr(locations, "snapshot_download", fetch)
 
 
 @pytest.mark.parametrize("place", ELSEWHERE)
@@ -462,7 +463,7 @@ def test_an_adapter_names_no_code(base, entry):
 def test_a_downloaded_checkpoint_names_no_folder_of_this_machine(base, tmp_path, nothing_fetched):
     (base / ".cache" / "huggingface").mkdir(parents=True)  # of `hf download`
     with pytest.raises(CheckpointError, match="Nothing is fetched"):
-        checkpoint.named_by(base, str(tmp_path), "")
+        locations.named_by(base, str(tmp_path), "")
 
 
 @pytest.mark.parametrize("repo_id", ["../../x", "/etc", "a/b/c", 3, None, "me/data"])

@@ -15,7 +15,7 @@ from lerobot_latentsafe.critic import SafetyCritic, risk_bellman_target
 from lerobot_latentsafe.decision import LawOptions
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.reachability import LatentReachability
-from lerobot_latentsafe.runtime.checkpoint import CheckpointError
+from lerobot_latentsafe.runtime.locations import CheckpointError
 from lerobot_latentsafe.safety_model import SafetyModel
 from lerobot_latentsafe.training import train_reachability
 

@@ -8,7 +8,7 @@ import torch
 from safetensors.torch import load_file
 
 from lerobot_latentsafe import training
-from lerobot_latentsafe.cli.options import PolicySource
+from lerobot_latentsafe.cli.places import PolicySource
 from lerobot_latentsafe.cli.train import Cache, TrainMargin, TrainReachability
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
 from lerobot_latentsafe.runtime.files import FolderInUseError

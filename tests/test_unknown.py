@@ -24,7 +24,8 @@ from lerobot_latentsafe.guard import standing_still
 from lerobot_latentsafe.modeling_latentsafe import STATISTICS, load_filter
 from lerobot_latentsafe.monitoring import parts_of
 from lerobot_latentsafe.pictures import averaged
-from lerobot_latentsafe.runtime.checkpoint import CheckpointError, seal_again
+from lerobot_latentsafe.runtime.checkpoint import seal_again
+from lerobot_latentsafe.runtime.locations import CheckpointError
 from lerobot_latentsafe.shield import Shield
 from lerobot_latentsafe.unknown import appearance, dynamics
 from lerobot_latentsafe.unknown.dynamics import Foretold, ages

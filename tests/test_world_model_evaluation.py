@@ -6,7 +6,7 @@ import tiny
 import torch
 
 from lerobot_latentsafe.cli.evaluate import EvalWorldModel
-from lerobot_latentsafe.cli.options import PolicySource
+from lerobot_latentsafe.cli.places import PolicySource
 from lerobot_latentsafe.evaluation import world_model as questions
 from lerobot_latentsafe.evaluation.world_model import balanced_accuracy, evaluate_world_model
 

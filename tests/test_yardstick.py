@@ -10,7 +10,8 @@ import tiny
 import torch
 
 from lerobot_latentsafe.cli.evaluate import EvalWorldModel
-from lerobot_latentsafe.cli.options import DatasetSource, OptionalPolicySource
+from lerobot_latentsafe.cli.options import DatasetSource
+from lerobot_latentsafe.cli.places import OptionalPolicySource
 from lerobot_latentsafe.datasets.frame_cache import FrameCacheError
 from lerobot_latentsafe.encoders.perception import FrameBasis
 from lerobot_latentsafe.evaluation import token_space, yardstick

@@ -1,33 +1,29 @@
 """`latentsafe <verb> --a.b=c`: LeRobot-style options, one dataclass a verb.
 
-Importing this loads neither LeRobot nor a model; `main` imports the verb that is asked for.
+Importing this loads nothing: `main` imports what the verb that is asked for needs.
 """
 
-import difflib
 import importlib
-import logging
 import os
 import sys
-from collections.abc import Iterable
-from dataclasses import dataclass
-
-logger = logging.getLogger(__name__)
+from typing import NamedTuple
 
 
-@dataclass(frozen=True)
-class Verb:
+class Verb(NamedTuple):
     """A verb of the console command.
 
     Attributes:
         group: what it helps with; see GROUPS.
         module, name: where its options class is, which has a method `run`.
         what: what it is for.
+        light: whether that module loads no LeRobot, so that the verb can refuse what it is given at once.
     """
 
     group: str
     module: str
     name: str
     what: str
+    light: bool = False
 
 
 GROUPS = {
@@ -58,7 +54,13 @@ VERBS: dict[str, Verb] = {
     "rename-features": Verb(
         "dataset", _DATASET, "RenameFeatures", "copy a dataset with the names of features that LeRobot expects"
     ),
-    "label": Verb("label", _LABEL, "Label", "open a local page on which a person marks where episodes fail"),
+    "label": Verb(
+        "label",
+        "lerobot_latentsafe.cli.label_page",
+        "Label",
+        "open a local page on which a person marks where episodes fail",
+        light=True,
+    ),
     "auto-label": Verb("label", _LABEL, "AutoLabel", "let a function or a vision-language model label the rest"),
     "check-labels": Verb("label", _LABEL, "CheckLabels", "list the labels that a trained filter disagrees with"),
     "carry-labels": Verb(
@@ -78,7 +80,13 @@ VERBS: dict[str, Verb] = {
     "calibrate": Verb("train", _TRAIN, "Calibrate", "choose epsilon on held-out episodes and store the evidence"),
     "wrap": Verb("deploy", _DEPLOY, "Wrap", "write a filter and the policy it shields as one self-contained folder"),
     "push": Verb("deploy", _DEPLOY, "Push", "push a filter, or a shielded policy, to the Hub with its card"),
-    "path": Verb("deploy", _DEPLOY, "PathOf", "print the folder of a committed checkpoint, for LeRobot's commands"),
+    "path": Verb(
+        "deploy",
+        "lerobot_latentsafe.cli.path",
+        "PathOf",
+        "print the folder of a committed checkpoint, for LeRobot's commands",
+        light=True,
+    ),
     "migrate-checkpoint": Verb(
         "deploy", _DEPLOY, "MigrateCheckpoint", "copy a checkpoint of a version before 0.2 into the present layout"
     ),
@@ -105,6 +113,7 @@ INTRODUCTION = """Latent safety filters for LeRobot.
 
 usage: latentsafe <verb> [--option=value ...]      latentsafe <verb> --help shows an example and all options
                                                    --debug shows where an error was raised
+       latentsafe completion                       how to have the Tab key complete verbs and options
 
 From episodes to a shielded policy:
   1. latentsafe collect --source=random --dataset.repo_id=me/car --dataset.root=data/car    (or lerobot-record)
@@ -125,14 +134,10 @@ def overview() -> str:
     return "\n".join(lines)
 
 
-def nearest(name: str, known: Iterable[str]) -> str | None:
-    """What was probably meant, if anything known resembles it."""
-    return next(iter(difflib.get_close_matches(name, list(known), n=1)), None)
-
-
 def main(argv: list[str] | None = None) -> None:
     """Entry point of the console command `latentsafe`."""
     os.environ.setdefault("MPLBACKEND", "Agg")  # pictures are written, never shown
+    os.environ.setdefault("DIFFUSERS_VERBOSITY", "error")  # it warns of parts that nobody asked for
     typed = sys.argv[1:] if argv is None else argv
     debug = "--debug" in typed
     verb, *options = [word for word in typed if word != "--debug"] or ["--help"]
@@ -140,12 +145,6 @@ def main(argv: list[str] | None = None) -> None:
         if not options:
             return print(overview())
         verb, options = options[0], ["--help"]  # latentsafe help <verb>
-    logging.basicConfig(format="%(levelname)s %(message)s")
-    if verb in RENAMED_VERBS:
-        logger.warning("latentsafe %s is now latentsafe %s", verb, RENAMED_VERBS[verb])
-        verb = RENAMED_VERBS[verb]
-    if verb not in VERBS:
-        meant = nearest(verb, VERBS)
-        hint = f"did you mean {meant}? latentsafe --help lists all" if meant else f"expected one of {', '.join(VERBS)}"
-        sys.exit(f"latentsafe: unknown verb {verb!r}; {hint}")
-    importlib.import_module("lerobot_latentsafe.cli.command_line").run(verb, VERBS[verb], options, debug)
+    if verb == "completion":
+        return importlib.import_module("lerobot_latentsafe.cli.completion").complete()
+    importlib.import_module("lerobot_latentsafe.cli.command_line").run(verb, options, debug)

@@ -5,15 +5,16 @@ from pathlib import Path
 
 from lerobot.policies.pretrained import PreTrainedPolicy
 
-from lerobot_latentsafe.cli.options import PolicySource
+from lerobot_latentsafe.cli.places import PolicySource
 from lerobot_latentsafe.decision import LawOptions
 from lerobot_latentsafe.migration import migrate_checkpoint
 from lerobot_latentsafe.model_card import measured
 from lerobot_latentsafe.modeling_latentsafe import load_filter
 from lerobot_latentsafe.policies.dreamer.modeling_dreamer import LatentSafeDreamerPolicy
-from lerobot_latentsafe.runtime.checkpoint import read_config, resolve_checkpoint
+from lerobot_latentsafe.runtime.checkpoint import read_config
 from lerobot_latentsafe.runtime.files import refuse_existing
 from lerobot_latentsafe.runtime.hub import push_policy, save_policy
+from lerobot_latentsafe.runtime.locations import resolve_checkpoint
 from lerobot_latentsafe.world_models.rssm import RSSM
 
 
@@ -87,23 +88,6 @@ class Push:
             evaluation |= measured(file, policy.config.law.name)
         policy.config.change(evaluation=evaluation)
         return policy
-
-
-@dataclass
-class PathOf:
-    """Print the folder of a committed checkpoint, for LeRobot's commands.
-
-    latentsafe path --name=bag
-
-    So `lerobot-eval --policy.path=$(latentsafe path --name=bag) ...` evaluates it.
-    """
-
-    name: str = "dubins"
-    """The checkpoint's name."""
-
-    def run(self) -> None:
-        """Print it."""
-        print(resolve_checkpoint(self.name))
 
 
 @dataclass

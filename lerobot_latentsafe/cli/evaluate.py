@@ -7,13 +7,8 @@ from pathlib import Path
 import numpy as np
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_latentsafe.cli.options import (
-    DatasetSource,
-    DefaultPolicySource,
-    OptionalDatasetSource,
-    OptionalPolicySource,
-    PolicySource,
-)
+from lerobot_latentsafe.cli.options import DatasetSource, OptionalDatasetSource
+from lerobot_latentsafe.cli.places import DefaultPolicySource, OptionalPolicySource, PolicySource
 from lerobot_latentsafe.decision import LawOptions
 from lerobot_latentsafe.dubins.ground_truth import load_states, truth_on
 from lerobot_latentsafe.encoders.patch_encoders import load_encoder

@@ -4,7 +4,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from lerobot_latentsafe.cli.options import DatasetSource, OptionalDatasetSource, PolicySource
+from lerobot_latentsafe.cli.options import DatasetSource, OptionalDatasetSource
+from lerobot_latentsafe.cli.places import PolicySource
 from lerobot_latentsafe.guarding import new_guard, with_guard
 from lerobot_latentsafe.looks import ALTERATIONS
 from lerobot_latentsafe.modeling_latentsafe import load_filter

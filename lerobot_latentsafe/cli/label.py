@@ -1,13 +1,12 @@
-"""Verbs that label: by a person on a page, by a function or a model, and what to do with labels."""
+"""Verbs that label by a function or a model, and those that check, carry and write labels."""
 
-import getpass
 import os
 import sys
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from pathlib import Path
 
-from lerobot_latentsafe.cli.options import DatasetSource, DefaultPolicySource, OptionalPolicySource
+from lerobot_latentsafe.cli.options import DatasetSource
+from lerobot_latentsafe.cli.places import DefaultPolicySource
 from lerobot_latentsafe.datasets.columns import push_dataset, write_columns
 from lerobot_latentsafe.datasets.labels import UNLABELLED
 from lerobot_latentsafe.evaluation.along_episodes import episode_margins
@@ -15,47 +14,10 @@ from lerobot_latentsafe.labeling import automatic
 from lerobot_latentsafe.labeling.carrying import carry_labels, specifications_in
 from lerobot_latentsafe.labeling.disagreements import find_disagreements, write_disagreements
 from lerobot_latentsafe.labeling.store import LabelStore, in_words
-from lerobot_latentsafe.labeling.suggestions import Suggester
 from lerobot_latentsafe.modeling_latentsafe import load_filter
 
 SHOWN = 10
 """Episodes without a label that are named."""
-
-
-@dataclass
-class Label:
-    """Open a local page on which a person marks where episodes fail; every key is saved beside the dataset.
-
-    latentsafe label --dataset.repo_id=me/bag --dataset.root=data/bag
-
-    With --policy.path, a trained filter draws its margin, guesses, and puts the most useful episodes first.
-    """
-
-    dataset: DatasetSource = field(default_factory=DatasetSource)
-    policy: OptionalPolicySource = field(default_factory=OptionalPolicySource)
-    specifications: list[str] = field(default_factory=lambda: ["failure"])
-    """What can fail: each name gets labels of its own; those that have a label file are offered anyway."""
-    user: str = field(default_factory=getpass.getuser)
-    """Who labels; kept with each label."""
-    host: str = "127.0.0.1"
-    """The address to listen at."""
-    port: int = 8765
-    """0 takes a free one."""
-
-    def run(self) -> None:
-        """Serve the page until interrupted."""
-        if not (find_spec("starlette") and find_spec("uvicorn")):
-            raise ImportError("the page needs starlette and uvicorn: pip install 'lerobot_policy_latentsafe[label]'")
-        from lerobot_latentsafe.labeling.app import LabelServer, listen, serve  # an optional dependency
-
-        self.dataset.require_whole("the page", "leave it out: the page shows all episodes, and unlabelled ones first")
-        frames = self.dataset.frames()
-        store = LabelStore(frames.root, frames.meta.repo_id, self.specifications)
-        server = LabelServer(store, frames, self.user)
-        listener = listen(self.host, self.port)
-        if self.policy.path:
-            server.suggester = Suggester(self.policy.path, frames.meta.repo_id, frames.root, server.suggestion_arrived)
-        serve(server, listener)
 
 
 @dataclass

@@ -1,4 +1,4 @@
-"""Options that several verbs share, in LeRobot's grammar: `--policy.path`, `--dataset.repo_id`."""
+"""Options of datasets that several verbs share, in LeRobot's grammar: `--dataset.repo_id`; and what is there."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +9,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.utils import CompatibilityError
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
+from lerobot_latentsafe.cli.places import DatasetPlace
 from lerobot_latentsafe.datasets.cameras import settled_cameras
 from lerobot_latentsafe.datasets.contract import Contract
 from lerobot_latentsafe.datasets.episodes import DatasetFrames
@@ -19,15 +20,8 @@ from lerobot_latentsafe.runtime.options import require_at_least
 
 
 @dataclass
-class DatasetSource:
-    """A LeRobotDataset: its id, and its folder if it is not in LeRobot's home."""
-
-    repo_id: str = "local/dataset"
-    """Its id, such as me/bag."""
-    root: str | None = None
-    """Its folder; by default LeRobot's own for this id."""
-    episodes: list[int] | None = None
-    """Numbers of the episodes to use, such as [0,1,2]; by default all."""
+class DatasetSource(DatasetPlace):
+    """A LeRobotDataset that is read: its id, and its folder if it is not in LeRobot's home."""
 
     def metadata(self) -> LeRobotDatasetMetadata:
         """What is known of a dataset that was read and found fit; see `Contract`.
@@ -115,15 +109,6 @@ class DatasetSource:
         """Those of the dataset's episodes that are named, or else the last ones, at most so many."""
         return np.unique(known)[-at_most:] if self.episodes is None else np.unique(self.episodes)
 
-    def require_whole(self, verb: str, remedy: str) -> None:
-        """Refuse `episodes` where a verb reads whole datasets.
-
-        Raises:
-            ValueError: with the remedy.
-        """
-        if self.episodes is not None:
-            raise ValueError(f"--dataset.episodes: {verb} reads whole datasets; {remedy}")
-
 
 CACHE_THEM = "cache those episodes: latentsafe cache --dataset.episodes=[...] writes a dataset that holds them alone"
 """The remedy of verbs that train."""
@@ -155,27 +140,3 @@ class NewDataset:
     def folder(self) -> Path:
         """Where it is written."""
         return self.root or HF_LEROBOT_HOME / self.repo_id
-
-
-@dataclass
-class PolicySource:
-    """A checkpoint."""
-
-    path: str
-    """A folder, a Hub id, or the name of a committed checkpoint (see `latentsafe path`)."""
-
-
-@dataclass
-class DefaultPolicySource(PolicySource):
-    """A checkpoint, by default the committed filter of the car."""
-
-    path: str = "dubins"
-    """A folder, a Hub id, or the name of a committed checkpoint (see `latentsafe path`)."""
-
-
-@dataclass
-class OptionalPolicySource:
-    """A checkpoint, or none."""
-
-    path: str | None = None
-    """A folder, a Hub id, or the name of a committed checkpoint (see `latentsafe path`)."""

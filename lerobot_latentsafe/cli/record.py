@@ -11,6 +11,7 @@ from lerobot.utils.constants import HF_LEROBOT_HOME
 
 from lerobot_latentsafe.cli.options import DatasetSource, NewDataset
 from lerobot_latentsafe.collection import dubins, franka, so101
+from lerobot_latentsafe.collection.quiet import quiet_recording
 from lerobot_latentsafe.collection.sent_actions import storing_what_was_sent
 from lerobot_latentsafe.datasets.columns import write_decisions
 from lerobot_latentsafe.datasets.decisions import FILE
@@ -80,6 +81,7 @@ class Collect:
             known = ", ".join([*dubins.SOURCES, *franka.SOURCES, *so101.SOURCES])
             raise ValueError(f"--source is {self.source!r}; expected one of {known}")
         new = self.dataset
+        quiet_recording()
         dataset = collect(self.source, new.repo_id, new.folder, new.num_episodes, self.seed)
         print(f"{dataset.num_episodes} episodes, {dataset.num_frames} frames in {new.folder}")
 

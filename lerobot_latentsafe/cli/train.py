@@ -16,7 +16,8 @@ from lerobot_latentsafe.calibration import (
     in_words,
     require_few_alarms,
 )
-from lerobot_latentsafe.cli.options import CACHE_THEM, DatasetSource, PolicySource
+from lerobot_latentsafe.cli.options import CACHE_THEM, DatasetSource
+from lerobot_latentsafe.cli.places import PolicySource
 from lerobot_latentsafe.conformal import fixed_sequence, needed_for_sure, proven
 from lerobot_latentsafe.datasets.build_cache import TOKEN_COMPONENTS, TOKEN_TYPES, Pictures, Tokens, build_frame_cache
 from lerobot_latentsafe.datasets.clips import ClipReader

@@ -156,14 +156,14 @@ def collect_dubins(source: str, repo_id: str, root: str | Path, n_episodes: int 
     episodes = cache(lambda: list(SOURCES[source](n, np.random.default_rng(seed))))
     options = {"source": source, "repo_id": repo_id, "seed": seed}
 
-    def record(numbers: range, folder: Path) -> None:
-        _write(episodes()[numbers.start : numbers.stop], source, repo_id, folder)
+    def record(numbers: range, folder: Path) -> Iterator[None]:
+        return _write(episodes()[numbers.start : numbers.stop], source, repo_id, folder)
 
     return record_in_parts(repo_id, root, options, n, record, EPISODES_A_PART)
 
 
-def _write(episodes: list[Episode], source: str, repo_id: str, root: Path) -> None:
-    """Write the dataset of some episodes."""
+def _write(episodes: list[Episode], source: str, repo_id: str, root: Path) -> Iterator[None]:
+    """Write the dataset of some episodes; yields after each."""
     features = {**FEATURES, **(POSITION if source in WITH_POSITION else {})}
     dataset = LeRobotDataset.create(
         repo_id, car.FPS, features, root=root, robot_type="latentsafe_dubins", use_videos=False,
@@ -174,6 +174,7 @@ def _write(episodes: list[Episode], source: str, repo_id: str, root: Path) -> No
         for frame in episode_frames(episode, renderer, features):
             dataset.add_frame(frame)
         dataset.save_episode()
+        yield
     dataset.finalize()
 
 

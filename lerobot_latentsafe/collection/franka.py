@@ -153,8 +153,8 @@ def collect_franka(
     return record_in_parts(repo_id, root, options, n, record, EPISODES_A_PART, workers)
 
 
-def _record(source: Source, repo_id: str, seed: int, episodes: range, root: Path) -> None:
-    """Write the dataset of some episodes."""
+def _record(source: Source, repo_id: str, seed: int, episodes: range, root: Path) -> Iterator[None]:
+    """Write the dataset of some episodes; yields after each."""
     dataset = LeRobotDataset.create(
         repo_id, SCENES[source.scene].fps, features(source), root=root, robot_type=LatentSafeFrankaMujoco.name,
         streaming_encoding=True, encoder_threads=1, metadata_buffer_size=EPISODES_A_PART,
@@ -166,6 +166,7 @@ def _record(source: Source, repo_id: str, seed: int, episodes: range, root: Path
             for frame in episode_frames(robot, source, episode, seed):
                 dataset.add_frame(frame)
             dataset.save_episode()
+            yield
     dataset.finalize()
 
 

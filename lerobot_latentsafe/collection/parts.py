@@ -7,16 +7,17 @@ are put together.
 import errno
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
+from threading import Thread
 
 from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from tqdm import tqdm
 
+from lerobot_latentsafe.collection.quiet import quiet_recording
 from lerobot_latentsafe.runtime.files import (
     claim,
     differing,
@@ -30,8 +31,10 @@ OPTIONS = "options.json"
 LITTLE = 2**23
 """Bytes left on a disk on which nothing can be recorded any more."""
 
-Record = Callable[[range, Path], None]
-"""Writes the finished dataset of some episodes into a folder, which it makes."""
+Record = Callable[[range, Path], Iterator[None]]
+"""Writes the dataset of some episodes into a folder, which it makes; yields after each episode."""
+Tell = Callable[[None], None]
+"""Hears of each episode that is recorded."""
 
 
 def record_in_parts(
@@ -73,19 +76,52 @@ def _is_finished(root: Path, repo_id: str, n_episodes: int, parts: Path, options
     return (root / "meta").exists() and LeRobotDatasetMetadata(repo_id, root=root).total_episodes == n_episodes
 
 
-def _record_all(record: Callable[[range], None], missing: list[range], workers: int) -> None:
-    with ExitStack() as stack:
-        # Spawned: a process that was forked cannot draw.
-        apply = stack.enter_context(get_context("spawn").Pool(workers)).imap if workers > 1 else map
-        progress = stack.enter_context(tqdm(desc="collecting", total=sum(map(len, missing)), unit="episode"))
-        for episodes, _ in zip(missing, apply(record, missing)):
-            progress.update(len(episodes))
+def _record_all(record: Callable[[range], Iterator[None]], missing: list[range], workers: int) -> None:
+    with tqdm(desc="collecting", total=sum(map(len, missing)), unit="episode") as progress:
+        if workers > 1:
+            return _record_side_by_side(record, missing, workers, progress)
+        for episodes in missing:
+            for _ in record(episodes):
+                progress.update()
 
 
-def _record_part(record: Record, parts: Path, episodes: range) -> None:
+def _record_side_by_side(
+    record: Callable[[range], Iterator[None]], missing: list[range], workers: int, progress: tqdm
+) -> None:
+    # Spawned: a process that was forked cannot draw.
+    context = get_context("spawn")
+    recorded = context.SimpleQueue()
+    counting = Thread(target=lambda: [progress.update() for _ in iter(recorded.get, OVER)])
+    with context.Pool(workers, _begin_work, (recorded.put,)) as pool:
+        counting.start()
+        try:
+            for _ in pool.imap(partial(_told, record), missing):
+                pass
+        finally:
+            recorded.put(OVER)
+            counting.join()
+
+
+OVER = "over"
+_tell: Tell | None = None
+"""How a worker says that an episode is recorded."""
+
+
+def _begin_work(tell: Tell) -> None:
+    global _tell
+    _tell = tell
+    quiet_recording()
+
+
+def _told(record: Callable[[range], Iterator[None]], episodes: range) -> None:
+    for recorded in record(episodes):
+        _tell(recorded)
+
+
+def _record_part(record: Record, parts: Path, episodes: range) -> Iterator[None]:
     with replacing_folder(_folder(parts, episodes)) as part:
         try:
-            record(episodes, part)
+            yield from record(episodes, part)
         except OSError as e:
             if shutil.disk_usage(parts).free > LITTLE:
                 raise

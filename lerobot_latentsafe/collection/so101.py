@@ -73,8 +73,8 @@ def collect_so101(name: str, repo_id: str, root: str | Path, n_episodes: int | N
     return record_in_parts(repo_id, root, options, n, partial(_record, name, repo_id, seed), EPISODES_A_PART)
 
 
-def _record(name: str, repo_id: str, seed: int, episodes: range, root: Path) -> None:
-    """Write the dataset of some episodes."""
+def _record(name: str, repo_id: str, seed: int, episodes: range, root: Path) -> Iterator[None]:
+    """Write the dataset of some episodes; yields after each."""
     dataset = LeRobotDataset.create(
         repo_id, FPS, FEATURES, root=root, robot_type=LatentSafeSO101Mujoco.name, use_videos=False,
         metadata_buffer_size=EPISODES_A_PART,
@@ -85,6 +85,7 @@ def _record(name: str, repo_id: str, seed: int, episodes: range, root: Path) -> 
             for frame in episode_frames(robot, part_of(name, episode), episode):
                 dataset.add_frame(frame)
             dataset.save_episode()
+            yield
     dataset.finalize()
 
 

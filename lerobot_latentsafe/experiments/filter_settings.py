@@ -7,7 +7,8 @@ from functools import cache
 from lerobot_latentsafe.base_policy import BasePolicy
 from lerobot_latentsafe.decision import LawConfig, LawOptions
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
-from lerobot_latentsafe.runtime.checkpoint import CONFIG, WEIGHTS, read_config, resolve_checkpoint
+from lerobot_latentsafe.runtime.checkpoint import WEIGHTS, read_config
+from lerobot_latentsafe.runtime.locations import CONFIG, resolve_checkpoint
 
 OPTIONS = ("epsilon", "proposal_steps", "resume_above", "kappa", "replan_above")
 """Of a law, what studies change."""

@@ -30,7 +30,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot_latentsafe.datasets.episodes import DatasetFrames
 from lerobot_latentsafe.datasets.labels import FailureLabels
 from lerobot_latentsafe.evaluation.statistics import provenance, write_json
-from lerobot_latentsafe.labeling.app import LabelServer, listen, serve
+from lerobot_latentsafe.labeling.app import LabelServer, serve
+from lerobot_latentsafe.labeling.listening import listen
 from lerobot_latentsafe.labeling.store import LabelStore
 
 if TYPE_CHECKING:

@@ -15,7 +15,8 @@ from lerobot.policies.factory import make_pre_post_processors
 from lerobot.processor import PolicyProcessorPipeline, ProcessorStepRegistry
 from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PREPROCESSOR_DEFAULT_NAME
 
-from lerobot_latentsafe.runtime.checkpoint import CONFIG, INTEGRITY, CheckpointError, read_json
+from lerobot_latentsafe.runtime.checkpoint import INTEGRITY, read_json
+from lerobot_latentsafe.runtime.locations import CONFIG, CheckpointError
 
 FILES = (f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json", f"{POLICY_POSTPROCESSOR_DEFAULT_NAME}.json")
 

@@ -6,12 +6,21 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from lerobot_latentsafe.experiments.bag.demo_filter import FilterSizes, train_filter
-from lerobot_latentsafe.experiments.demo import NO_GUARANTEE, SIDE_BY_SIDE, Demo
+from lerobot_latentsafe.experiments.demo import (
+    NO_GUARANTEE,
+    SIDE_BY_SIDE,
+    Demo,
+    durations,
+    told,
+    where_the_minutes_went,
+)
 from lerobot_latentsafe.experiments.filter_settings import law_of
 from lerobot_latentsafe.model_card import rate_in_words
 from lerobot_latentsafe.reports import html
-from lerobot_latentsafe.runtime.checkpoint import resolve_checkpoint
+from lerobot_latentsafe.runtime.locations import resolve_checkpoint
 
+MODULES = ("lerobot_latentsafe.registration", "lerobot_latentsafe.modeling_latentsafe", "lerobot.policies.factory")
+"""What all commands import, but MuJoCo."""
 OPERATORS = {"closed_end": "pulls the closed end up", "open_end": "lifts the open end"}
 
 
@@ -56,12 +65,13 @@ def run_demo(out: Path, filter: str, base: str | None, n: int, encoder: str | No
         resolve_checkpoint(base)
     if out.exists():
         shutil.rmtree(out)
-    demo = Demo(out)
+    demo = Demo(out, MODULES)
     if encoder is not None:
         filter = train_filter(demo, encoder, sizes)
     law = law_of(filter).name
     run_experiments(demo, filter, base, law, n)
-    report(out, law, demo.seconds)
+    demo.finish()
+    report(out, law, demo.seconds, demo.minutes)
 
 
 def cells(out: Path, law: str) -> dict[str, dict]:
@@ -80,7 +90,7 @@ def cells(out: Path, law: str) -> dict[str, dict]:
 HEADER = ["", "spilled any candy", "share of candies lost", "safe success", "steps overridden"]
 
 
-def report(out: Path, law: str, seconds: float) -> None:
+def report(out: Path, law: str, seconds: float, minutes: dict[str, float]) -> None:
     """Print the table; write metrics.json and report.html."""
     found = cells(out, law)
     rows = [
@@ -96,19 +106,19 @@ def report(out: Path, law: str, seconds: float) -> None:
     metrics = {
         **{who: {key: cell[key] for key in kept if key in cell} for who, cell in found.items()},
         "spilled_p_value": p_value,
-        "minutes": round(seconds / 60, 1),
+        **durations(seconds, minutes),
     }
     (out / "metrics.json").write_text(json.dumps(metrics, indent=2))
     title = "A latent safety filter keeps candies in an open bag"
-    html.write_report(out / "report.html", title, page(out, rows, p_value))
+    html.write_report(out / "report.html", title, page(out, rows, p_value, minutes))
     print()
     for row in [HEADER, *rows]:
         print(f"{row[0]:<45}", *(f"{cell:<30}" for cell in row[1:]))
     print(f"\nspills of lifts by the closed end, bare against shielded: p = {p_value:.1g}")
-    print(f"{metrics['minutes']} minutes. Open {out / 'report.html'}; numbers in {out / 'metrics.json'}")
+    print(told(out, metrics))
 
 
-def page(out: Path, rows: list[list[str]], p_value: float) -> list[str]:
+def page(out: Path, rows: list[list[str]], p_value: float, minutes: dict[str, float]) -> list[str]:
     """The parts of report.html."""
     seen = "V along lifts. Orange: the filter acts. Grey: a candy falls out."
     spills = "How many runs of the policy spill at least p% of the candies."
@@ -129,5 +139,6 @@ def page(out: Path, rows: list[list[str]], p_value: float) -> list[str]:
         *(html.picture(path, spills) for path in out.glob("policies.png")),
         html.heading("What the filter sees coming"),
         *(html.picture(out / f"{name}.png", seen) for name in OPERATORS),
+        *where_the_minutes_went(minutes),
         html.paragraph(f"A few runs for a demonstration; results/bag holds the full ones. {NO_GUARANTEE}", note=True),
     ]

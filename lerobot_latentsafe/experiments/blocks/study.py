@@ -18,7 +18,8 @@ from lerobot_latentsafe.franka.scene import FrankaScene
 from lerobot_latentsafe.latent import Latent
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
 from lerobot_latentsafe.policies.dreamer.modeling_dreamer import stored_world_model
-from lerobot_latentsafe.runtime.checkpoint import read_config, resolve_checkpoint
+from lerobot_latentsafe.runtime.checkpoint import read_config
+from lerobot_latentsafe.runtime.locations import resolve_checkpoint
 from lerobot_latentsafe.safety_model import SafetyModel
 
 

@@ -8,10 +8,23 @@ from pathlib import Path
 import numpy as np
 
 from lerobot_latentsafe.dubins.ground_truth import grid_states
-from lerobot_latentsafe.experiments.demo import NO_GUARANTEE, SIDE_BY_SIDE, Demo
+from lerobot_latentsafe.experiments.demo import (
+    NO_GUARANTEE,
+    SIDE_BY_SIDE,
+    Demo,
+    durations,
+    told,
+    where_the_minutes_went,
+)
 from lerobot_latentsafe.model_card import rate_in_words
 from lerobot_latentsafe.reports import html
 
+MODULES = (
+    "lerobot.scripts.lerobot_train",
+    "lerobot.policies.diffusion.modeling_diffusion",
+    *(f"lerobot_latentsafe.cli.{group}" for group in ("record", "train", "deploy", "evaluate")),
+)
+"""What the commands import."""
 CANDIDATES = "[[-1.25,1.0],[0.0,1.0],[1.25,1.0]]"
 
 
@@ -63,9 +76,9 @@ class DubinsDemo(Demo):
         self.run(
             "wrap",
             *("latentsafe", "wrap", f"--policy.path={critic}", f"--base_policy_path={base}"),
-            *(f"--law.epsilon={epsilon}", "--law.proposal_steps=6", f"--output_dir={out}/shielded"),
+            *(f"--law.epsilon={epsilon}", "--law.proposal_steps=9", f"--output_dir={out}/shielded"),
         )
-        np.save(out / "states.npy", grid_states()[::7])  # enough for a demonstration's three digits
+        np.save(out / "states.npy", grid_states()[::29])  # enough for a demonstration's three digits
         self.run(
             "monitor against the exact safe set",
             *("latentsafe", "eval-monitor", f"--policy.path={out}/shielded", "--env.type=latentsafe_dubins"),
@@ -94,7 +107,7 @@ def run_demo(out: Path, epsilon: float, n_episodes: int) -> None:
     """
     if out.exists():
         shutil.rmtree(out)
-    demo = DubinsDemo(out)
+    demo = DubinsDemo(out, MODULES)
     # Two cores, two branches: the policy to be shielded is trained beside the filter.
     found: dict[str, str] = {}
     branch = threading.Thread(target=lambda: found.update(base=demo.reckless()))
@@ -104,7 +117,8 @@ def run_demo(out: Path, epsilon: float, n_episodes: int) -> None:
     if "base" not in found:
         raise SystemExit("demo: the reckless policy could not be trained; see the message above")
     demo.shield(critic, found["base"], epsilon, n_episodes)
-    report(out, demo.seconds)
+    demo.finish()
+    report(out, demo.seconds, demo.minutes)
 
 
 HEADER = ["diffusion policy", "safe success", "violation", "stall"]
@@ -115,21 +129,16 @@ SCORES = {
 }
 
 
-def report(out: Path, seconds: float) -> None:
+def report(out: Path, seconds: float, minutes: dict[str, float]) -> None:
     """Print the table; write metrics.json and report.html."""
     shield, monitor = (json.loads((out / f"{name}.json").read_text()) for name in ("shield", "monitor"))
     rows = [
         [name, *(rate_in_words(shield[name][key]) for key in ("success", "violation", "stall"))]
         for name in ("bare", "shielded")
     ]
-    metrics = headline_numbers(shield, monitor, seconds)
+    metrics = headline_numbers(shield, monitor, seconds, minutes)
     (out / "metrics.json").write_text(json.dumps(metrics, indent=2))
-    names = {
-        "F1, safe positive": "f1_safe",
-        "F1, unsafe positive": "f1_unsafe",
-        "balanced accuracy": "balanced_accuracy",
-    }
-    scores = [[name, f"{monitor[key]:.3f}"] for name, key in names.items()]
+    scores = [[name, f"{monitor[key]:.3f}"] for name, key in SCORES.items()]
     html.write_report(
         out / "report.html",
         "A latent safety filter shields a reckless diffusion policy",
@@ -141,10 +150,10 @@ def report(out: Path, seconds: float) -> None:
     acted, p_value = metrics["overridden_share"], metrics["violation_p_value"]
     print(f"\nfilter acted in {acted:.1%} of steps; violations: p = {p_value:.1g}")
     print("monitor against the exact safe set:", ", ".join(f"{name} {value}" for name, value in scores))
-    print(f"{metrics['minutes']} minutes. Open {out / 'report.html'}; numbers in {out / 'metrics.json'}")
+    print(told(out, metrics))
 
 
-def headline_numbers(shield: dict, monitor: dict, seconds: float) -> dict:
+def headline_numbers(shield: dict, monitor: dict, seconds: float, minutes: dict[str, float]) -> dict:
     """What metrics.json holds, of what eval-shield and eval-monitor wrote."""
     rates = {f"{name}_{key}": shield[name][key] for name in ("bare", "shielded") for key in ("violation", "success")}
     return {
@@ -153,7 +162,7 @@ def headline_numbers(shield: dict, monitor: dict, seconds: float) -> dict:
         "significant": bool(shield["violation_p_value"] < 0.05),
         "overridden_share": shield["shielded"]["overridden_share"],
         **{key: monitor[key] for key in ("f1_safe", "f1_unsafe", "balanced_accuracy", "safe_policy")},
-        "minutes": round(seconds / 60, 1),
+        **durations(seconds, minutes),
     }
 
 
@@ -176,6 +185,7 @@ def page(out: Path, rows: list[list[str]], scores: list[list[str]], metrics: dic
         html.heading("The safe set it learnt from images"),
         html.table(["against the exact solution", ""], scores),
         html.picture(out / "value_slices.png", "Learned boundary (solid) and the exact one (dashed)."),
+        *where_the_minutes_went(metrics["cpu_minutes_of"]),
         html.paragraph(
             f"This is a small training for a demonstration; results/ holds the full one. {NO_GUARANTEE}", note=True
         ),

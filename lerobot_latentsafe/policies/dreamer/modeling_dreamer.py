@@ -16,14 +16,9 @@ from lerobot_latentsafe.model_card import make_task_policy_card
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
 from lerobot_latentsafe.policies.dreamer.behavior import Actor, ReturnRange, TwoHotHead, imagine, lambda_returns
 from lerobot_latentsafe.policies.dreamer.configuration_dreamer import LatentSafeDreamerConfig
-from lerobot_latentsafe.runtime.checkpoint import (
-    CheckpointError,
-    fitting_weights,
-    named_by,
-    read_config,
-    resolve_checkpoint,
-)
+from lerobot_latentsafe.runtime.checkpoint import fitting_weights, read_config
 from lerobot_latentsafe.runtime.hub import save_policy
+from lerobot_latentsafe.runtime.locations import CheckpointError, named_by, resolve_checkpoint
 from lerobot_latentsafe.safety_model import SafetyModel, UntrainedFilterError
 
 WORLD_MODEL_FOLDER = "world_model"
