@@ -322,7 +322,7 @@ class Shield:
         """V of actions (B, K, A), l now (B,); the fallback (B, A); whether an override would be the retreat's (B,)."""
         model = self.model
         margin = model.imagination.margin(latent)
-        predicted, on_the_way = model.go_on(latent, ahead, max(1, model.config.law.samples))
+        predicted, on_the_way = model.go_on(latent, ahead)
         both = {key: torch.cat([predicted[key], latent[key]]) for key in latent}  # one pass through imagination
         sizes = [len(on_the_way), len(hold)]
         (value, here), (_, action) = (part.split(sizes) for part in model.plan(both))
