@@ -346,13 +346,11 @@ class Shield:
         if not len(rows):
             return found
         accepted = found.candidate if self._accepted is None else self._accepted
-        of = lambda numbers: numbers[rows]  # noqa: E731
-        nearest = self.nearest.find(
-            Asked(
-                select(latent, self.model.tensor(rows)), *map(of, (proposed, fallback, hold, self.guard.pose)),
-                [*map(of, self.guard.proposed_before)], *map(of, (value, threshold, accepted)),
-            )
-        )  # fmt: skip
+        at = select(latent, self.model.tensor(rows))
+        before = [earlier[rows] for earlier in self.guard.proposed_before]
+        robots, judged = (proposed, fallback, hold, self.guard.pose), (value, threshold, accepted)
+        (wanted, back, stay, pose), (v, limit, last) = ([numbers[rows] for numbers in of] for of in (robots, judged))
+        nearest = self.nearest.find(Asked(at, wanted, back, stay, pose, before, v, limit, last))
         found.action[rows], found.candidate[rows] = nearest
         return found
 
