@@ -213,14 +213,15 @@ class SafetyModel(nn.Module):
         """The value of going through a margin l to a latent of some value, all (...,): Eq. 5 undiscounted."""
         return BACKUPS.get(self.config.law.critic, safety_bellman_target)(margin, value, 1.0)
 
-    def go_on(self, latent: Latent, ahead: Tensor, n: int = 1) -> tuple[Latent, Tensor]:
+    def go_on(self, latent: Latent, ahead: Tensor, n: int | None = None) -> tuple[Latent, Tensor]:
         """n x B latents after `law.proposal_steps` ticks, and the least margin until there (n x B,).
 
         Args:
             ahead: (B, K, A), actions as they are heard: the first step hears these, those after it the last, held.
-            n: futures of each latent.
+            n: futures of each latent; by default as many as `law.samples`, at least one.
         """
         law, imagination = self.config.law, self.imagination
+        n = n or max(1, law.samples)
         action, held = ahead.flatten(1).repeat(n, 1), ahead[:, -1].repeat(n, ahead.shape[1])
         latent = map_latent(latent, lambda t: t.repeat(n, *[1] * (t.dim() - 1)))
         least = torch.full_like(action[:, 0], torch.inf)
@@ -250,7 +251,7 @@ class SafetyModel(nn.Module):
             roughly: by one future, and without looking ahead: no bound, but cheaper still.
         """
         law, sizes, imagination = self.config.law, self.config.world_model, self.imagination
-        n, horizon = (1, 0) if roughly else (max(1, law.samples), sizes.steps(law.lookahead))
+        n, horizon = (1, 0) if roughly else (None, sizes.steps(law.lookahead))
         predicted, least = self.go_on(latent, heard[:, None].repeat(1, sizes.frame_skip, 1), n)
         none_held = self.units.still[:0]
         value = look_ahead(imagination, predicted, none_held, horizon, self.critic)[0]

@@ -322,7 +322,7 @@ class Shield:
         """V of actions (B, K, A), l now (B,); the fallback (B, A); whether an override would be the retreat's (B,)."""
         model = self.model
         margin = model.imagination.margin(latent)
-        predicted, on_the_way = model.go_on(latent, ahead, max(1, model.config.law.samples))
+        predicted, on_the_way = model.go_on(latent, ahead)
         both = {key: torch.cat([predicted[key], latent[key]]) for key in latent}  # one pass through imagination
         sizes = [len(on_the_way), len(hold)]
         (value, here), (_, action) = (part.split(sizes) for part in model.plan(both))
@@ -346,13 +346,11 @@ class Shield:
         if not len(rows):
             return found
         accepted = found.candidate if self._accepted is None else self._accepted
-        of = lambda numbers: numbers[rows]  # noqa: E731
-        nearest = self.nearest.find(
-            Asked(
-                select(latent, self.model.tensor(rows)), *map(of, (proposed, fallback, hold, self.guard.pose)),
-                [*map(of, self.guard.proposed_before)], *map(of, (value, threshold, accepted)),
-            )
-        )  # fmt: skip
+        at = select(latent, self.model.tensor(rows))
+        before = [earlier[rows] for earlier in self.guard.proposed_before]
+        robots, judged = (proposed, fallback, hold, self.guard.pose), (value, threshold, accepted)
+        (wanted, back, stay, pose), (v, limit, last) = ([numbers[rows] for numbers in of] for of in (robots, judged))
+        nearest = self.nearest.find(Asked(at, wanted, back, stay, pose, before, v, limit, last))
         found.action[rows], found.candidate[rows] = nearest
         return found
 

@@ -542,5 +542,7 @@ def test_baseline_laws_need_no_critic(tiny_world_model, law):
 
 
 def test_unknown_law_is_refused():
-    with pytest.raises(ValueError, match=r"law.name is 'luck'; expected one of reachability, risk, plan, margin"):
+    with pytest.raises(
+        ValueError, match=r"law.name is 'luck'; expected one of reachability, nearest, risk, plan, margin"
+    ):
         tiny.config(law_name="luck")

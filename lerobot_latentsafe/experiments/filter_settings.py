@@ -31,7 +31,9 @@ class FilterSetting:
     def of(cls, path: str, options: LawOptions) -> "FilterSetting":
         """The filter's own law, with what is given of these options."""
         law = law_of(path).changed(options)
-        return cls(path, law.name, *(getattr(law, name) for name in OPTIONS), fingerprint(path))
+        return cls(
+            path=path, law=law.name, fingerprint=fingerprint(path), **{name: getattr(law, name) for name in OPTIONS}
+        )
 
     @classmethod
     def from_job(cls, job: dict | None) -> "FilterSetting | None":

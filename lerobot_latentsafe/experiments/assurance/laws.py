@@ -21,6 +21,7 @@ from lerobot_latentsafe.experiments.filter_settings import FilterSetting, as_job
 from lerobot_latentsafe.experiments.scene_world import OperatorActor, SceneWorld
 from lerobot_latentsafe.franka.bag import BagScene
 from lerobot_latentsafe.franka.behaviors import begin
+from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.nearest import Distance
 
 LAWS = ("reachability", "nearest")
@@ -85,8 +86,8 @@ def run(job: dict) -> dict:
         return {"episodes": [_lifted(operators.run({**job, "operator": study.drivers[job["driver"]]}))]}
     policy = operators.load(setting, study.drivers[job["driver"]])
     runs = run_episodes(policy, study.env(), job["n"], job["seed"])
-    rows = [{name: bool(getattr(runs, name)[i]) for name in OUTCOMES} for i in range(job["n"])]
-    if setting is None:
+    rows: list[dict] = [{name: bool(getattr(runs, name)[i]) for name in OUTCOMES} for i in range(job["n"])]
+    if not isinstance(policy, LatentSafePolicy):
         return {"episodes": rows}
     distance = Distance(policy.model.units)
     for row, trace in zip(rows, runs.traces):
@@ -128,7 +129,7 @@ def against(cells: dict[str, dict], rows: dict[str, list[dict]]) -> dict:
     names = ("deviation", "deviation_of_changed", "changed_share", "fallback_share")
     return {
         **{name: ours[name] / theirs[name] if theirs[name] else None for name in names},
-        "violation_p_value": paired_p_value(*([row["violation"] for row in rows[law]] for law in LAWS[::-1])),
+        "violation_p_value": paired_p_value(*(np.array([row["violation"] for row in rows[law]]) for law in LAWS)),
     }
 
 
@@ -149,7 +150,8 @@ class Timed(NamedTuple):
 
 def begin_timed(name: str, driver: str, law: str, seed: int) -> Timed:
     """An episode of a study under a law."""
-    study, proposing = STUDIES[name], []
+    study = STUDIES[name]
+    proposing: list[float] = []
     setting = FilterSetting.of(study.filter, LawOptions(name=law))
     if study.env is None:
         scene = BagScene()
@@ -178,7 +180,8 @@ def tick_cost(name: str, driver: str, n: int) -> dict:
     """CPU milliseconds of ticks under both laws in turn: of the filter alone, and with the policy that it shields."""
     took: dict[str, dict[str, list[float]]] = {law: {"filter": [], "with_policy": []} for law in LAWS}
     for seed in range(STUDIES[name].first_seed + TICKS_SEED, STUDIES[name].first_seed + TICKS_SEED + n):
-        runs, costs = {law: begin_timed(name, driver, law, seed) for law in LAWS}, {law: [] for law in LAWS}
+        runs = {law: begin_timed(name, driver, law, seed) for law in LAWS}
+        costs: dict[str, list[float]] = {law: [] for law in LAWS}
         actors = {law: timed(runs[law].actor, costs[law]) for law in LAWS}
         while not any(of.world.over.all() for of in runs.values()):
             for law, of in runs.items():
