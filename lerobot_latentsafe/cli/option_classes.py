@@ -177,21 +177,20 @@ def _blocks(doc: str) -> list[str]:
 
 def told() -> dict[str, Any]:
     """All verbs, choices and the options of what may be chosen, as `known_options.FILE` holds them."""
+    options = {verb: list(options_of(options_class(verb))) for verb in VERBS}
+    choices: dict[str, dict[str, str]] = {}
+    types: dict[str, list[Option]] = {}
+    for those in options.values():
+        _collect(those, choices, types)
     verbs = {
         verb: {
             "text": inspect.getdoc(options_class(verb)),
             "renamed": RENAMED.get(verb, {}),
-            "options": list(options_of(options_class(verb))),
+            "options": [_row(option) for option in those],
         }
-        for verb in VERBS
+        for verb, those in options.items()
     }
-    choices: dict[str, dict[str, str]] = {}
-    types: dict[str, list[Option]] = {}
-    for entry in verbs.values():
-        _collect(entry["options"], choices, types)
-    as_rows = {name: [_row(option) for option in options] for name, options in sorted(types.items())}
-    for entry in verbs.values():
-        entry["options"] = [_row(option) for option in entry["options"]]
+    as_rows = {name: [_row(option) for option in those] for name, those in sorted(types.items())}
     return {"lerobot": version("lerobot"), "verbs": verbs, "choices": dict(sorted(choices.items())), "types": as_rows}
 
 
