@@ -15,10 +15,10 @@ from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 ENVS = {"dubins": LatentSafeDubinsEnv, "bag": LatentSafeBagEnv, "blocks": LatentSafeBlocksEnv}
 POLICIES = {"dubins": "dubins_diffusion_reckless", "bag": "bag_diffusion_weak", "blocks": "blocks_dreamer"}
 """What drives while observations are recorded: the policies that the filters are meant to shield."""
-SEEDS = {"dubins": [700, 701], "bag": [702, 700], "blocks": [300_003, 300_005]}
-SKIP = {"dubins": 0, "bag": 46, "blocks": 28}
+SEEDS = {"dubins": [700, 701], "bag": [704, 700], "blocks": [300_003, 300_005]}
+SKIP = {"dubins": 0, "bag": 64, "blocks": 28}
 """Steps driven before the recording starts: the filters first act some steps later."""
-STEPS = {"dubins": 36, "bag": 20, "blocks": 20}
+STEPS = {"dubins": 36, "bag": 24, "blocks": 20}
 
 
 def drive(name: str) -> dict[str, np.ndarray]:
