@@ -50,7 +50,7 @@ def learn(name: str, data: Path) -> None:
     for field in ("state_low", "state_high", "state_step", "action_step", "action_jerk", "unanswered", "looks"):
         value = asdict(known)[field]
         config["trained_on"][field] = value if field == "looks" else np.round(value, 5).tolist()
-    (folder / CONFIG).write_text(json.dumps(config, indent=4) + "\n")
+    (folder / CONFIG).write_text(json.dumps(config, indent=1) + "\n")
     seal_again(folder)
     print(f"{name}: {len(contract.episode)} frames of {len(contract.lengths)} episodes")
 

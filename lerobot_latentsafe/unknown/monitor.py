@@ -54,11 +54,12 @@ class Familiar(NamedTuple):
         return self.profile.standardised(scores, ticks) / self.scale
 
     def tensors(self) -> dict[str, Tensor]:
-        """As a file holds them: large ones in half precision."""
+        """As a file holds them: large ones in half precision, colours of patches in eight bits as in a picture."""
         parts = {"library": self.library, "usual": self.usual or (), "profile": self.profile}
         found = {f"{name}.{i}": numbers for name, part in parts.items() for i, numbers in enumerate(part)}
         small = {"scale": self.scale, "strangest": self.strangest}
         halves = {name: torch.from_numpy(numbers.astype(np.float16)) for name, numbers in found.items()}
+        halves["library.0"] = (torch.from_numpy(self.library.mean).clamp(0, 1) * 255).round().to(torch.uint8)
         return halves | {name: torch.from_numpy(numbers.astype(np.float32)) for name, numbers in small.items()}
 
     @classmethod
@@ -68,7 +69,10 @@ class Familiar(NamedTuple):
         Raises:
             StatisticsError: something is missing, of another shape, or not finite.
         """
-        numbers = {name: tensor.float().numpy() for name, tensor in tensors.items()}
+        numbers = {
+            name: (tensor.float() / (255 if tensor.dtype == torch.uint8 else 1)).numpy()
+            for name, tensor in tensors.items()
+        }
         try:
             part = lambda name, n: [numbers[f"{name}.{i}"] for i in range(n)]  # noqa: E731
             usual = Usual(*part("usual", 4)) if "usual.0" in numbers else None
