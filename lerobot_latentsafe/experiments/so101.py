@@ -53,9 +53,12 @@ def compare_operators(filters: Sequence[str], n: int, law: LawOptions) -> dict[s
     Returns:
         operator -> bare, or the filter's path: rates of falls and successes, and the share of steps overridden.
     """
-    scene, table = PushScene(), {}
+    scene, table = PushScene(), dict[str, dict]()
     for behavior in ("reckless", "careful"):
-        cells = {"bare": None, **{path: load_filter(path, law=law) for path in filters}}
+        cells: dict[str, LatentSafePolicy | None] = {
+            "bare": None,
+            **{path: load_filter(path, law=law) for path in filters},
+        }
         table[behavior] = {}
         for name, filter in cells.items():
             rows = [operate(scene, filter, behavior, FIRST_SEED + i) for i in trange(n, desc=f"{behavior}, {name}")]

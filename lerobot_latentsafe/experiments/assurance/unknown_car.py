@@ -78,8 +78,9 @@ def seen(kind: Kind, episode: Episode) -> tuple[Tensor, np.ndarray, np.ndarray, 
 def monitored(policy: LatentSafePolicy, episodes: list[Episode]) -> LatentSafePolicy:
     """The policy with a monitor that is fitted to these healthy episodes."""
     parts = parts_of(list(range(len(episodes))), ALPHA, has_reference=False)
-    gathered = [[_gathered(policy, episodes[i]) for i in part] for part in parts]
-    return with_monitor(policy, learn(*gathered, SMOOTH_S * car.FPS), ALPHA, len(parts[0]) + len(parts[1]))
+    first, second, third = ([_gathered(policy, episodes[i]) for i in part] for part in parts)
+    familiar = learn(first, second, third, SMOOTH_S * car.FPS)
+    return with_monitor(policy, familiar, ALPHA, len(first) + len(second))
 
 
 def _gathered(policy: LatentSafePolicy, episode: Episode) -> Replayed:
