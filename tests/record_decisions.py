@@ -16,7 +16,7 @@ ENVS = {"dubins": LatentSafeDubinsEnv, "bag": LatentSafeBagEnv, "blocks": Latent
 POLICIES = {"dubins": "dubins_diffusion_reckless", "bag": "bag_diffusion_weak", "blocks": "blocks_dreamer"}
 """What drives while observations are recorded: the policies that the filters are meant to shield."""
 SEEDS = {"dubins": [700, 701], "bag": [704, 700], "blocks": [300_003, 300_005]}
-SKIP = {"dubins": 0, "bag": 64, "blocks": 28}
+SKIP = {"dubins": 0, "bag": 66, "blocks": 28}
 """Steps driven before the recording starts: the filters first act some steps later."""
 STEPS = {"dubins": 36, "bag": 24, "blocks": 20}
 
