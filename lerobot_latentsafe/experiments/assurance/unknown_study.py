@@ -35,8 +35,9 @@ STEPS, SIZE = 90, 96
 """Ticks of an episode, its unrecorded grasp included; pixels a side of what is kept."""
 FIRST_SEED = 700_000
 """No filter was trained or set on these."""
-LOOKS_STRANGE = (Reason.UNKNOWN_APPEARANCE, Reason.OBSERVATION_UNFAMILIAR)
-"""The monitor says so, or the guard, which knows noise and cameras that are exchanged or turned."""
+LOOKS_STRANGE = (Reason.UNKNOWN_APPEARANCE, Reason.OBSERVATION_UNFAMILIAR, Reason.OBSERVATION_MISSING)
+"""The monitor says so; or the guard, which knows noise, cameras that are exchanged or turned, and those that show
+nothing like the data."""
 AT_ONCE = 5
 """Ticks within which a fault of a camera is to be told."""
 SHARES = {"rise": (0.5, 0, 0, 0, 0, 0, 0.5), "branch": (0.6, 0, 0, 0.2, 0, 0, 0.2)}
