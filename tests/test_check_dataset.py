@@ -301,7 +301,7 @@ def test_debug_shows_the_traceback_wherever_it_stands(capsys, tmp_path, place):
     "error", [KeyError("observation.state"), IndexError("list index out of range"), TypeError(), AssertionError("no")]
 )
 def test_errors_that_nobody_meant_name_their_class(capsys, monkeypatch, error):
-    from lerobot_latentsafe.cli.deploy import PathOf
+    from lerobot_latentsafe.cli.path import PathOf
 
     def fail(self):
         raise error

@@ -144,6 +144,7 @@ class Closes:
     up = 0.9
     """More than the limits allow."""
     planned = coming = None
+    is_told = False
 
     def __init__(self):
         self.executed = []

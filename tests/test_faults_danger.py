@@ -47,7 +47,7 @@ def bag():
     scene = BagScene()
     scene.reset(5)
     operator, action = lift(scene, CLOSED_END, 0.1, np.random.default_rng(0)), np.zeros(7)
-    for _ in range(40):
+    for _ in range(46):
         action = next(operator, action)
         scene.step(action)
     return Danger("bag", SceneWorld(scene, 1).observe(), torch.from_numpy(next(operator)).float()[None])

@@ -13,7 +13,6 @@ import pyarrow.parquet as pq
 import pytest
 from lerobot.configs.train import TrainPipelineConfig
 
-from lerobot_latentsafe.cli import VERBS as COMMANDS
 from lerobot_latentsafe.cli import command_line, main
 from lerobot_latentsafe.collection.whole_episodes import COMPLETE
 from lerobot_latentsafe.datasets.layout import INFO
@@ -32,8 +31,7 @@ def test_what_is_typed_is_understood(name, tmp_path):
     if verb == "lerobot-train":
         assert draccus.parse(TrainPipelineConfig, args=options).save_freq == 1
         return
-    entry = COMMANDS[verb]
-    assert command_line.parsed(verb, getattr(__import__(entry.module, fromlist=[entry.name]), entry.name), options)
+    assert command_line.parsed(verb, options)
 
 
 def test_runs_that_left_the_same_are_told_from_others(tmp_path):

@@ -125,12 +125,15 @@ def test_a_robot_behind_an_old_filter_is_refused(verb, tmp_path):
         main([verb, f"--filter={old}", *robot, *(dataset if verb == "record" else [])])
 
 
+SINCE_0_3_OF_THE_LAW = [("law", name) for name in ("slack_ms", "unknown", "kappa", "replan_above")]
+
+
 def assert_same(first, second, n_steps=6):
     """Two folders hold the same configuration, weights and decisions."""
     configs = [json.loads((folder / "config.json").read_text()) for folder in (first, second)]
     for config in configs:
         assert config["reachability"].pop("kept", None) is None
-        for group, name in (("law", "slack_ms"), ("law", "unknown"), ("margin", "noise")):
+        for group, name in (*SINCE_0_3_OF_THE_LAW, ("margin", "noise")):
             config[group].pop(name, None)
         for name in SINCE_0_3:
             config["trained_on"].pop(name, None)
