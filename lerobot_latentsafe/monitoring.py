@@ -28,10 +28,10 @@ from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, world_model
 from lerobot_latentsafe.safety_model import SafetyModel
 from lerobot_latentsafe.shield import Shield
 from lerobot_latentsafe.units import Monitored
-from lerobot_latentsafe.unknown import appearance, dynamics
+from lerobot_latentsafe.unknown import appearance, dynamics, placement
 from lerobot_latentsafe.unknown.appearance import Seen
 from lerobot_latentsafe.unknown.dynamics import Usual
-from lerobot_latentsafe.unknown.monitor import Familiar
+from lerobot_latentsafe.unknown.monitor import Familiar, n_scores
 from lerobot_latentsafe.unknown.threshold import TooFewEpisodesError, profile, rank_of
 
 logger = logging.getLogger(__name__)
@@ -217,13 +217,13 @@ def learn(
     first: Sequence[Replayed], second: Sequence[Replayed], third: Sequence[Replayed], smooth: float
 ) -> Familiar:  # fmt: skip
     """All numbers of a monitor, of three parts of the episodes; smoothed over so many ticks."""
-    library = appearance.learn(Seen.joined([episode.seen for episode in first]))
+    shown = Seen.joined([episode.seen for episode in first])
+    library, background = appearance.learn(shown), placement.learn(shown.grey)
     usual: Usual | None = None
     if first[0].differences is not None:
         usual = dynamics.learn(np.concatenate([episode.differences for episode in first]))
-    n_scores = appearance.SCORES * len(library.mean) + (0 if usual is None else 2 * len(usual.mean))
-    nothing = np.ones(n_scores, np.float32)
-    familiar = Familiar(library, usual, profile([nothing[None]], 1.0), nothing, np.zeros(1, np.float32))
+    nothing = np.ones(n_scores(len(library.mean), usual), np.float32)
+    familiar = Familiar(library, background, usual, profile([nothing[None]], 1.0), nothing, np.zeros(1, np.float32))
     scores = [familiar.scores_of(*vars(episode).values()) for episode in second]
     familiar = familiar._replace(profile=profile(scores, smooth))
     scale = np.median([strangest(familiar, score) for score in scores], 0)

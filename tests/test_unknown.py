@@ -3,8 +3,10 @@
 import json
 import math
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
@@ -27,8 +29,9 @@ from lerobot_latentsafe.pictures import averaged
 from lerobot_latentsafe.runtime.checkpoint import seal_again
 from lerobot_latentsafe.runtime.locations import CheckpointError
 from lerobot_latentsafe.shield import Shield
-from lerobot_latentsafe.unknown import appearance, dynamics
+from lerobot_latentsafe.unknown import appearance, dynamics, placement
 from lerobot_latentsafe.unknown.dynamics import Foretold, ages
+from lerobot_latentsafe.unknown.placement import Placement
 from lerobot_latentsafe.unknown.threshold import Drift, TooFewEpisodesError, e_value, profile, rank_of
 
 CAMERA = "observation.image"
@@ -147,6 +150,62 @@ def test_a_picture_unlike_the_data_is_strange(name):
         for x in (pictures(50, seed=1), ALTERED[name](pictures(50, seed=1)))
     )
     assert (strange.max(1) > usual.max()).all()
+
+
+def room(n: int, size: int = 96, seed: int = 0) -> np.ndarray:
+    """Grey pictures uint8 (n, 1, size, size): a table and a window that stand still, something that does not, noise."""
+    rng = np.random.default_rng(seed)
+    pictures = np.full((n, size, size), 0.4, np.float32)
+    pictures[:, size // 2 :, size // 8 :] = 0.6
+    pictures[:, size // 8 : size // 3, size // 2 : -size // 6] = 0.8
+    for picture, (row, column) in zip(pictures, rng.integers(0, size - size // 8, (n, 2))):
+        picture[row : row + size // 8, column : column + size // 8] = rng.uniform(0, 1)
+    return ((pictures + rng.normal(0, 0.01, pictures.shape)).clip(0, 1) * 255).astype(np.uint8)[:, None]
+
+
+def seen_by(matrix: list[list[float]]) -> Callable[[np.ndarray], np.ndarray]:
+    def change(picture: np.ndarray) -> np.ndarray:
+        return cv2.warpAffine(picture, np.float32(matrix), picture.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
+
+    return change
+
+
+DISPLACED = {
+    "to the side": seen_by([[1, 0, 2.2], [0, 1, 0]]),
+    "up": seen_by([[1, 0, 0], [0, 1, -3]]),
+    "far away": seen_by([[1, 0, 9], [0, 1, 7]]),
+    "turned": seen_by(cv2.getRotationMatrix2D((48, 48), 5, 1)),
+    "nearer": seen_by(cv2.getRotationMatrix2D((48, 48), 0, 1.08)),
+    "mirrored": lambda x: x[:, ::-1],
+    "upside down": lambda x: x[::-1, ::-1],
+    "out of focus": lambda x: cv2.GaussianBlur(x, (0, 0), 2),
+}
+
+
+@pytest.mark.parametrize("name", DISPLACED)
+def test_a_camera_that_stands_elsewhere_is_told_by_what_stands_still(name):
+    stands = Placement(placement.learn(room(200)))
+    usual, shown = stands.scores(room(50, seed=1)), room(50, seed=2)
+    elsewhere = stands.scores(np.stack([DISPLACED[name](picture)[None] for picture in shown[:, 0]]))
+    assert elsewhere.min() > usual.max() + 0.2
+
+
+NO_MOVE = {
+    "darker": lambda x: (0.8 * x).astype(np.uint8),
+    "half covered": lambda x: np.concatenate([x[..., :48, :], np.full_like(x[..., 48:, :], 90)], -2),
+}
+
+
+@pytest.mark.parametrize("name", NO_MOVE)
+def test_what_covers_the_background_or_dims_it_moves_no_camera(name):
+    stands = Placement(placement.learn(room(200)))
+    assert stands.scores(NO_MOVE[name](room(50, seed=1))).max() < 0.2
+
+
+@pytest.mark.parametrize("size", [20, 64, 96])
+def test_a_camera_before_which_nothing_stands_still_is_never_told(size):
+    noise = np.random.default_rng(0).integers(0, 255, (60, 1, size, size), np.uint8)
+    assert np.abs(Placement(placement.learn(noise)).scores(noise)).max() < 0.9
 
 
 @pytest.mark.parametrize("size", [20, 32, 64, 96, 224])

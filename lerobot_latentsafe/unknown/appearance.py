@@ -40,7 +40,7 @@ OFFENDING = 8
 FURTHEST = 100.0
 """A colour counts as so far off at most, a squared distance: one that the data lack is infinitely far from nothing."""
 SCORES = 3
-"""Of each camera."""
+"""Of each camera; where it stands is a fourth, see `placement`."""
 FRAMES = 6_000
 """Frames that the kinds are learned from, at most."""
 ROUNDS = 8
@@ -55,10 +55,12 @@ class Seen(NamedTuple):
     Attributes:
         patches: (B, C, P, NUMBERS).
         colours: (B, C, SHADES^3), the root of the number of points of each colour, of POINTS^2 at most.
+        grey: uint8 (B, C, H, W), the pictures without colour, of FINEST pixels a side at most.
     """
 
     patches: np.ndarray
     colours: np.ndarray
+    grey: np.ndarray
 
     @classmethod
     def joined(cls, parts: Sequence["Seen"]) -> "Seen":
@@ -98,7 +100,8 @@ def views(images: dict[str, Tensor], keys: list[str]) -> Seen:
     apart_cells = cells.reshape(n, c, of, GRID, 2, GRID, 2)
     patches = apart_cells.transpose(0, 1, 3, 5, 2, 4, 6).reshape(n, c, GRID**2, NUMBERS)
     points = averaged(pictures, POINTS) if max(pictures.shape[-2:]) > POINTS else pictures
-    return Seen(patches, on_host(_colours(points)))
+    grey = (pictures.mean(-3) * 255).round().clamp(0, 255).to(torch.uint8)
+    return Seen(patches, on_host(_colours(points)), on_host(grey, torch.uint8))
 
 
 def _colours(points: Tensor) -> Tensor:

@@ -16,10 +16,13 @@ from lerobot_latentsafe.host import any_of
 from lerobot_latentsafe.unknown import appearance, dynamics
 from lerobot_latentsafe.unknown.appearance import Library, Seen
 from lerobot_latentsafe.unknown.dynamics import Usual
+from lerobot_latentsafe.unknown.placement import Background, Placement
 from lerobot_latentsafe.unknown.threshold import Drift, Profile
 
 logger = logging.getLogger(__name__)
 
+LOOKS = appearance.SCORES + 1
+"""Scores of each camera."""
 QUIET_S = 1.0
 """Seconds without an alarm after which what a camera shows counts as familiar again."""
 
@@ -29,10 +32,11 @@ class StatisticsError(ValueError):
 
 
 class Familiar(NamedTuple):
-    """All numbers that a monitor has learned. Scores are three of each camera, and two of each age of a foretelling.
+    """All numbers that a monitor has learned. Scores are LOOKS of each camera, and two of each age of a foretelling.
 
     Attributes:
         library: of the cameras' patches and colours.
+        background: what stands still before the cameras.
         usual: differences of foretellings; None where there is no world model.
         profile: of all S scores.
         scale: (S,), the median M of each score, so that none of them alone sets the threshold.
@@ -40,6 +44,7 @@ class Familiar(NamedTuple):
     """
 
     library: Library
+    background: Background
     usual: Usual | None
     profile: Profile
     scale: np.ndarray
@@ -54,13 +59,16 @@ class Familiar(NamedTuple):
         return self.profile.standardised(scores, ticks) / self.scale
 
     def tensors(self) -> dict[str, Tensor]:
-        """As a file holds them: large ones in half precision, colours of patches in eight bits as in a picture."""
+        """As a file holds them: large ones in half precision, colours in eight bits as in a picture."""
         parts = {"library": self.library, "usual": self.usual or (), "profile": self.profile}
         found = {f"{name}.{i}": numbers for name, part in parts.items() for i, numbers in enumerate(part)}
+        pictures = {"library.0": found.pop("library.0"), "background.0": self.background.mean}
+        colours = {name: (numbers.clip(0, 1) * 255).round() for name, numbers in pictures.items()}
         small = {"scale": self.scale, "strangest": self.strangest}
-        halves = {name: torch.from_numpy(numbers.astype(np.float16)) for name, numbers in found.items()}
-        halves["library.0"] = (torch.from_numpy(self.library.mean).clamp(0, 1) * 255).round().to(torch.uint8)
-        return halves | {name: torch.from_numpy(numbers.astype(np.float32)) for name, numbers in small.items()}
+        as_kept = (found, np.float16), (colours, np.uint8), (small, np.float32)
+        arrays = {name: numbers.astype(kept) for part, kept in as_kept for name, numbers in part.items()}
+        arrays["background.1"] = np.packbits(self.background.still, -1)
+        return {name: torch.from_numpy(numbers) for name, numbers in arrays.items()}
 
     @classmethod
     def of(cls, tensors: dict[str, Tensor]) -> "Familiar":
@@ -75,10 +83,12 @@ class Familiar(NamedTuple):
         }
         try:
             part = lambda name, n: [numbers[f"{name}.{i}"] for i in range(n)]  # noqa: E731
-            usual = Usual(*part("usual", 4)) if "usual.0" in numbers else None
+            mean, packed = numbers["background.0"], tensors["background.1"].numpy()
+            still = np.unpackbits(packed, -1, count=mean.shape[-1] - 1).astype(bool)
             found = cls(
-                Library(*part("library", len(Library._fields))), usual, Profile(*part("profile", 2)), numbers["scale"],
-                numbers["strangest"],
+                Library(*part("library", len(Library._fields))), Background(mean, still),
+                Usual(*part("usual", 4)) if "usual.0" in numbers else None, Profile(*part("profile", 2)),
+                numbers["scale"], numbers["strangest"],
             )  # fmt: skip
         except KeyError as e:
             raise StatisticsError(f"the statistics of the monitor lack {e}; fit them again: latentsafe monitor") from e
@@ -99,12 +109,7 @@ class Familiar(NamedTuple):
     @property
     def n_scores(self) -> int:
         """S."""
-        return self.n_looks + (0 if self.usual is None else 2 * len(self.usual.mean))
-
-    @property
-    def n_looks(self) -> int:
-        """The first scores, of what the cameras show."""
-        return appearance.SCORES * self.n_cameras
+        return n_scores(self.n_cameras, self.usual)
 
     def scores_of(self, seen: Seen, differences: np.ndarray | None) -> np.ndarray:
         """All scores (N, S) of ticks.
@@ -113,7 +118,7 @@ class Familiar(NamedTuple):
             seen: of N frames, see `appearance.views`.
             differences: (N, H, D), see `Foretold.differences`; None where there is no world model.
         """
-        looks = appearance.strangeness(seen, self.library).reshape(-1, self.n_looks)
+        looks = looks_of(seen, self.library, Placement(self.background))
         return looks if self.usual is None else np.concatenate([looks, self.surprises(differences)], 1)
 
     def surprises(self, differences: np.ndarray) -> np.ndarray:
@@ -126,6 +131,17 @@ class Familiar(NamedTuple):
         for name, tensor in sorted(self.tensors().items()):
             digest.update(name.encode() + tensor.numpy().tobytes())
         return digest.hexdigest()[:16]
+
+
+def n_scores(n_cameras: int, usual: Usual | None) -> int:
+    """How many scores there are of so many cameras, and of foretellings, if there are any."""
+    return LOOKS * n_cameras + (0 if usual is None else 2 * len(usual.mean))
+
+
+def looks_of(seen: Seen, library: Library, stands: Placement) -> np.ndarray:
+    """Scores (N, cameras x LOOKS) of what is seen."""
+    scores = [appearance.strangeness(seen, library), stands.scores(seen.grey)[..., None]]
+    return np.concatenate(scores, -1).reshape(len(seen.grey), -1)
 
 
 class UnknownMonitor:
@@ -147,6 +163,7 @@ class UnknownMonitor:
 
     def __init__(self, familiar: Familiar, keys: Sequence[str], alpha: float, rank: int, fps: float):
         self.familiar, self.keys, self.alpha = familiar, list(keys), alpha
+        self._stands = Placement(familiar.background)
         self.threshold = familiar.threshold(rank)
         self.foretells = familiar.usual is not None
         self.drift, self._told_drift = Drift(familiar.strangest), False
@@ -182,7 +199,7 @@ class UnknownMonitor:
         if self._since is None:
             self._since, self._surprised = np.full(n, self._quiet), np.zeros(n, bool)
             self._strangest = np.full(n, -np.inf)
-        scores = appearance.strangeness(appearance.views(images, self.keys), self.familiar.library).reshape(n, -1)
+        scores = looks_of(appearance.views(images, self.keys), self.familiar.library, self._stands)
         strange = self._standardised(scores, slice(0, scores.shape[1]))
         strange[~seen] = np.nan
         self.share = self._note(strange, Reason.UNKNOWN_APPEARANCE)
@@ -244,5 +261,8 @@ class UnknownMonitor:
 
     def _named(self, reason: Reason, score: int) -> str:
         if reason == Reason.UNKNOWN_APPEARANCE:
-            return f"APPEARANCE: {self.keys[score // appearance.SCORES]} shows what the data do not"
+            camera, kind = self.keys[score // LOOKS], score % LOOKS
+            if kind == LOOKS - 1:
+                return f"APPEARANCE: {camera} was moved or turned, or is out of focus"
+            return f"APPEARANCE: {camera} shows what the data do not"
         return "DYNAMICS: what follows from the actions is not what the world model foretold"
