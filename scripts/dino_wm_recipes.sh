@@ -2,10 +2,9 @@
 # Three recipes of a DINO-WM at equal CPU time, three seeds each, on the recordings of scripts/reproduce_bag.sh: as
 # published (concatenation, teacher forcing, every frame, a token a patch), the compact one of version 0.3 (AdaLN, open
 # loop, every frame), and that of configs/bag_dino_wm.yaml. Resumable: what exists is skipped.
-#   scripts/dino_wm_recipes.sh [OUT]   needs $DATA/bag_tokens, $DATA/bag_whole (latentsafe cache --token_components=0
-#     --basis_from=$DATA/bag_tokens), $DATA/held_branches and $DATA/held_lifts with their caches
-# Writes results/bag/recipes.json. The steps were chosen so that each takes about as many CPU seconds as 1,050 steps of
-# the last one.
+#   scripts/dino_wm_recipes.sh [OUT]   needs $DATA/bag_whole (latentsafe cache --token_components=0
+#     --basis_from=$DATA/bag_tokens), which serves all three, $DATA/held_branches and $DATA/held_lifts with their caches
+# Writes results/bag/recipes.json. The steps were chosen so that each takes about as many CPU seconds.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 OUT=${1:-outputs/dino_wm_recipes} DATA=${DATA:-data} SEEDS=${SEEDS:-0 1 2} BIN=.venv/bin
@@ -23,8 +22,8 @@ COMPACT="$WHOLE --policy.world_model.clip_length=9 --policy.world_model.dim=96 -
   --policy.world_model.heads=3 --policy.world_model.mlp=384 --policy.world_model.observed=3
   --policy.world_model.change_weight=0.7"
 
-recipe() { # name cache steps seed options...
-  local name=$1 cache=$2 steps=$3 seed=$4; shift 4
+recipe() { # name steps seed options...
+  local name=$1 steps=$2 seed=$3 cache="$DATA/bag_whole"; shift 3
   local wm="$OUT/wm_${name}_$seed" data="--dataset.repo_id=latentsafe/bag_cache --dataset.root=$cache"
   if [ ! -e "$wm/done" ]; then
     rm -rf "$wm"
@@ -39,9 +38,9 @@ recipe() { # name cache steps seed options...
 
 models=()
 for seed in $SEEDS; do
-  recipe published "$DATA/bag_whole" "${STEPS_PUBLISHED:-1500}" "$seed" $PUBLISHED
-  recipe compact "$DATA/bag_whole" "${STEPS_COMPACT:-500}" "$seed" $COMPACT
-  recipe new "$DATA/bag_tokens" 1050 "$seed"
+  recipe published "${STEPS_PUBLISHED:-1500}" "$seed" $PUBLISHED
+  recipe compact "${STEPS_COMPACT:-500}" "$seed" $COMPACT
+  recipe new "${STEPS_NEW:-1050}" "$seed"
   for name in published compact new; do models+=("${name}_$seed=$OUT/margin_${name}_$seed"); done
 done
 $BIN/python scripts/bag_world_models.py --models "${models[@]}" --data="$DATA" --cost="$OUT/cost.csv" --output="$RESULT"
