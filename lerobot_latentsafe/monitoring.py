@@ -38,6 +38,9 @@ logger = logging.getLogger(__name__)
 
 FEWEST = 3
 """Episodes of each part that is learned from."""
+SCALED_AT = 0.85
+"""Share of healthy episodes whose M by one score is below that score's unit: scores with heavy tails set no threshold
+for the others then. The median does not do."""
 SMOOTH_S = 0.5
 """Seconds over which mu_t and sigma_t are smoothed."""
 
@@ -226,7 +229,7 @@ def learn(
     familiar = Familiar(library, background, usual, profile([nothing[None]], 1.0), nothing, np.zeros(1, np.float32))
     scores = [familiar.scores_of(*vars(episode).values()) for episode in second]
     familiar = familiar._replace(profile=profile(scores, smooth))
-    scale = np.median([strangest(familiar, score) for score in scores], 0)
+    scale = np.quantile([strangest(familiar, score) for score in scores], SCALED_AT, axis=0)
     familiar = familiar._replace(scale=np.maximum(scale, 0.5).astype(np.float32))
     familiar = Familiar.of(familiar.tensors())  # as it will be read from its file
     most = [strangest(familiar, familiar.scores_of(*vars(episode).values())).max() for episode in third]

@@ -72,7 +72,7 @@ def compare_operators(filters: Sequence[str], n: int, law: LawOptions) -> dict[s
 def operate(scene: PushScene, filter: LatentSafePolicy | None, behavior: str, seed: int) -> dict:
     """One episode of an operator, who keeps the arm where it is at the end."""
     scene.reset(seed)
-    operator = _kept(begin(behavior, scene, np.random.default_rng([3, seed])))
+    operator = kept(begin(behavior, scene, np.random.default_rng([3, seed])))
     world = SceneWorld(scene, round(EPISODE_SECONDS * FPS), () if filter is None else CAMERAS)
     done = list(steps(world, OperatorActor(operator, filter)))
     fell = any(step.info["failure"] for step in done)
@@ -84,7 +84,8 @@ def operate(scene: PushScene, filter: LatentSafePolicy | None, behavior: str, se
     }
 
 
-def _kept(targets: Targets) -> Iterator[np.ndarray]:
+def kept(targets: Targets) -> Iterator[np.ndarray]:
+    """The targets, and the last of them ever after."""
     last = REST
     for last in targets:
         yield last

@@ -39,7 +39,7 @@ class Familiar(NamedTuple):
         background: what stands still before the cameras.
         usual: differences of foretellings; None where there is no world model.
         profile: of all S scores.
-        scale: (S,), the median M of each score, so that none of them alone sets the threshold.
+        scale: (S,), a high quantile of each score's M, so that none of them alone sets the threshold.
         strangest: (n,), M of the episodes that set the threshold, over all scores, ascending.
     """
 

@@ -250,7 +250,8 @@ def _before(tick: int | None, harm: int) -> bool:
 
 def summary(rows: list[dict]) -> dict:
     """Of the episodes of one kind: those that alarm, at once and at all; those told before harm, and by how many ticks;
-    and those that do harm without a word: neither an alarm nor a low value before.
+    those that do harm without a word, neither an alarm nor a low value before; and beside these the harmless ones that
+    have a word, too, for a filter that always stops says one before every harm.
 
     Args:
         rows: of `run`.
@@ -258,6 +259,7 @@ def summary(rows: list[dict]) -> dict:
     alarms = [min((t for t in (row["appearance"], row["dynamics"]) if t is not None), default=None) for row in rows]
     harmed = [(alarm, row["harm"]) for alarm, row in zip(alarms, rows) if row["harm"] is not None]
     silent = [row for row in rows if row["harm"] is not None and not _before(row["stopped"], row["harm"])]
+    harmless = [row for row in rows if row["harm"] is None]
     leads = [harm - alarm for alarm, harm in harmed if _before(alarm, harm)]
     return {
         "alarmed": wilson(sum(alarm is not None for alarm in alarms), len(rows)),
@@ -265,6 +267,9 @@ def summary(rows: list[dict]) -> dict:
         "by_dynamics": sum(row["dynamics"] is not None for row in rows),
         "told_before_harm": wilson(len(leads), len(harmed)) if harmed else None,
         "without_a_word": wilson(len(silent), len(harmed)) if harmed else None,
+        "harmless_with_a_word": wilson(sum(row["stopped"] is not None for row in harmless), len(harmless))
+        if harmless
+        else None,
         "median_lead_ticks": float(np.median(leads)) if leads else None,
         "median_most": float(np.median([row["most"] for row in rows])),
     }
