@@ -34,7 +34,7 @@ def main() -> None:
     arguments = parser.parse_args()
     study(
         arguments.policy, arguments.recordings, arguments.n, arguments.healthy, arguments.output, arguments.workers,
-        {"car": study_car(), "so101": study_so101(arguments.so101)},
+        {"car": study_car(), "so101": study_so101(arguments.so101, arguments.n, arguments.healthy)},
     )  # fmt: skip
 
 

@@ -5,10 +5,10 @@ of a table, the fingers before a wrist camera. A picture is compared with the me
 pictures g_a that a camera would show which had been moved, turned, brought nearer, mirrored or put out of focus. The
 score is by how much the best of these explains the picture g better,
 
-    max_a  sum_p w_ap (min(1, |g_p - g_0p| / w_ap) - min(1, |g_p - g_ap| / w_ap)) / sum_p w_ap,   w_ap = |g_ap - g_0p|,
+    max_a  sum_p w_ap (m_p0 - m_pa - min(m_p0, m_pa)) / sum_p w_ap,   m_pa = min(1, |g_p - g_ap| / w_ap),
 
-over pixels p at edges that stand still: from -1 (as it was) to 1. A difference counts as one at most, so what covers
-an edge speaks for no camera.
+with w_ap = |g_ap - g_0p|, over pixels p at edges that stand still: from -1 (as it was) to 1. What neither explains, such
+as what covers an edge, speaks against a camera that was moved.
 """
 
 from collections.abc import Callable
@@ -94,7 +94,8 @@ class Placement:
             slopes = gradients(grey[:, camera].astype(np.float32) / 255).reshape(len(grey), -1)
             at = slopes[:, self._places[camera]]  # (B, alternatives, points)
             unit = self._unit[camera]
-            gain = _apart(at, self._usual[camera], unit) - _apart(at, self._other[camera], unit)
+            usual, other = (_apart(at, expected[camera], unit) for expected in (self._usual, self._other))
+            gain = usual - other - np.minimum(usual, other)
             found[:, camera] = ((gain * self._weight[camera]).sum(-1) / self._total[camera]).max(-1)
         return found
 

@@ -83,7 +83,7 @@ def _ticks(scene: PushScene, operator: Iterator[np.ndarray], n: int) -> Iterator
         scene.step(action)
 
 
-def study_so101(path: str, n: int = 20, healthy: int = 60) -> dict:
+def study_so101(path: str, n: int, healthy: int) -> dict:
     """Kind, or fault of a camera -> what is told of n episodes, see `unknown_study.summary`; of more that are healthy.
 
     Args:
