@@ -7,8 +7,8 @@ score is by how much the best of these explains the picture g better,
 
     max_a  sum_p w_ap (m_p0 - m_pa - min(m_p0, m_pa)) / sum_p w_ap,   m_pa = min(1, |g_p - g_ap| / w_ap),
 
-with w_ap = |g_ap - g_0p|, over pixels p at edges that stand still: from -1 (as it was) to 1. What neither explains, such
-as what covers an edge, speaks against a camera that was moved.
+with w_ap = |g_ap - g_0p|, over pixels p at edges that stand still: from -1 (as it was) to 1. What neither explains,
+such as what covers an edge, speaks against a camera that was moved.
 """
 
 from collections.abc import Callable
