@@ -202,6 +202,13 @@ def test_what_covers_the_background_or_dims_it_moves_no_camera(name):
     assert stands.scores(NO_MOVE[name](room(50, seed=1))).max() < 0.2
 
 
+def test_a_mirrored_picture_of_a_symmetric_scene_says_nothing():
+    """Else the noise of nearly equal pictures would be the score of all."""
+    symmetric = np.maximum(room(200), room(200)[..., ::-1])
+    stands = Placement(placement.learn(symmetric))
+    assert np.median(stands.scores(symmetric)) < -0.5
+
+
 @pytest.mark.parametrize("size", [20, 64, 96])
 def test_a_camera_before_which_nothing_stands_still_is_never_told(size):
     noise = np.random.default_rng(0).integers(0, 255, (60, 1, size, size), np.uint8)

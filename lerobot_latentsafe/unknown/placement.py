@@ -21,6 +21,9 @@ STILL = 1.0
 """An edge stands still where its mean gradient is more than so many standard deviations."""
 LEAST = 0.004
 """Least standard deviation of a gradient: a grey level."""
+APART = 0.1
+"""Another camera is thought of where its edges differ from those of the mean picture by such a share of these: of a
+symmetric scene the mirrored picture says nothing."""
 POINTS = 120
 """Pixels at which g_0, and each g_a, are compared: those of the strongest edges."""
 SIDE = 96.0
@@ -43,7 +46,7 @@ class Background(NamedTuple):
 
 def learn(grey: np.ndarray) -> Background:
     """The background of grey pictures uint8 (N, C, H, W)."""
-    mean = np.asarray(grey.mean(0), np.float32) / 255
+    mean = grey.mean(0).round().astype(np.float32) / 255  # as a file keeps it
     slope = gradients(mean)
     deviation = np.stack([gradients(camera.astype(np.float32) / 255).std(0) for camera in grey.swapaxes(0, 1)])
     return Background(mean, np.abs(slope) > STILL * (deviation + LEAST))
@@ -86,6 +89,8 @@ class Placement:
         self._weight = np.abs(self._other - self._usual)
         self._unit = self._weight + 1e-6
         self._total = self._weight.sum(-1) + 1e-6
+        edges = np.abs(self._usual[..., :POINTS]).sum(-1)
+        self._told = self._total > APART * edges + 1e-3
 
     def scores(self, grey: np.ndarray) -> np.ndarray:
         """Of pictures uint8 (B, C, H, W): (B, C)."""
@@ -96,7 +101,8 @@ class Placement:
             unit = self._unit[camera]
             usual, other = (_apart(at, expected[camera], unit) for expected in (self._usual, self._other))
             gain = usual - other - np.minimum(usual, other)
-            found[:, camera] = ((gain * self._weight[camera]).sum(-1) / self._total[camera]).max(-1)
+            gain = (gain * self._weight[camera]).sum(-1) / self._total[camera]
+            found[:, camera] = gain.max(-1, initial=-1.0, where=self._told[camera])
         return found
 
 

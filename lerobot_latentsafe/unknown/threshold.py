@@ -18,6 +18,9 @@ from lerobot_latentsafe.conformal import needed, rank
 
 PRIOR = 20.0
 """Frames that the mean over all times counts for, beside those of one time."""
+LEAST = 0.1
+"""Standard deviation of a score at least: of a logarithm, a tenth of what it is of. One that hardly ever changes would
+otherwise set the threshold where it does."""
 LONGEST = 600
 """Ticks of an episode that have means of their own, at most."""
 
@@ -42,7 +45,7 @@ def profile(episodes: Sequence[np.ndarray], smooth: float) -> Profile:
     """The profile of scores of episodes, (T_i, S) each, NaN where there is none; smoothed over so many ticks.
 
     An episode may begin anywhere, so a time is never surer than half of all times are: sigma_t is at least half the
-    deviation over all of them.
+    deviation over all of them, and LEAST.
     """
     length = min(LONGEST, max(map(len, episodes)))
     n, total, square = (np.zeros((length, episodes[0].shape[1])) for _ in range(3))
@@ -57,7 +60,7 @@ def profile(episodes: Sequence[np.ndarray], smooth: float) -> Profile:
     mean = (total + PRIOR * everywhere[0]) / n
     second = (square + PRIOR * (everywhere[1] + everywhere[0] ** 2)) / n
     variance = np.maximum(second - mean**2, everywhere[1] / 4)
-    return Profile(mean.astype(np.float32), np.sqrt(variance + 1e-6).astype(np.float32))
+    return Profile(mean.astype(np.float32), np.sqrt(np.maximum(variance, LEAST**2)).astype(np.float32))
 
 
 def rank_of(n: int, alpha: float) -> int:
