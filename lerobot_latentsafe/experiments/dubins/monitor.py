@@ -67,7 +67,8 @@ class LatentMonitor:
         imagination, horizon = model.imagination, model.config.world_model.steps(law.lookahead)
         value = look_ahead(imagination, latent, model.units.still[:0], horizon, model.critic)[0]
         open_still = (value <= 0) & (imagination.margin(latent) > 0)
-        value[open_still] = model.value(select(latent, open_still))
+        if open_still.any():
+            value[open_still] = model.value(select(latent, open_still))
         return value > 0
 
     @torch.no_grad()
