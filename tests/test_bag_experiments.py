@@ -178,10 +178,12 @@ def test_the_demo_records_nothing_for_an_encoder_that_cannot_see(script, tmp_pat
 
 
 def test_a_demo_logs_each_command_and_counts_its_minutes(tmp_path, capsys):
-    shown = Demo(tmp_path / "demo")
+    shown = Demo(tmp_path / "demo", usual={"where": 1.0, "break": 3.0})
     shown.run("where: is the bag?", "latentsafe", "path", "--name=bag")
     assert "pretrained/bag" in (tmp_path / "demo" / "logs" / "where.log").read_text()
-    assert "where: is the bag?" in capsys.readouterr().out
+    shown.say("go on")
+    first, second = capsys.readouterr().out.splitlines()
+    assert "[....................]   0% where: is the bag?" in first and "[#####...............]  25% go on" in second
     broken = tmp_path / "broken.py"
     broken.write_text("1 / 0")
     for command, words in (

@@ -33,7 +33,7 @@ class ExactMonitor:
         return exact_value(states)
 
     def start(self):
-        def act(states):
+        def act(states, kept):
             after = [exact_value(car.step(states, np.full(len(states), u))) for u in car.TURN_RATES]
             return car.TURN_RATES[np.argmax(after, 0)]
 
@@ -122,7 +122,7 @@ def test_exact_controller_keeps_all_feasible_starts_safe():
 
 class Straight(ExactMonitor):
     def start(self):
-        return lambda states: np.zeros(len(states))
+        return lambda states, kept: np.zeros(len(states))
 
 
 def test_rollouts_notice_a_violation_on_the_way():
@@ -131,6 +131,12 @@ def test_rollouts_notice_a_violation_on_the_way():
     assert runs["failed"].tolist() == [True, False, False]
     assert (runs["safe"], runs["n"]) == (2, 3)
     assert runs["trajectories"].shape[0] == 3
+
+
+def test_a_run_is_over_after_a_failure():
+    runs = safe_policy_rollouts(Straight(), np.array([[-0.9, 0.0, 0.0], [-0.9, 0.8, 0.0]]))
+    stopped, driven = runs["trajectories"][:, -1, 0]
+    assert -0.5 < stopped < -0.4 and driven > 1.1
 
 
 def test_what_is_out_of_view_cannot_fail():
@@ -159,7 +165,27 @@ def test_learned_monitors_run(latent, kind):
     assert (value <= latent.margin(STATES) + 1e-6).all()
     act = monitor.start()
     for states in (STATES, car.step(STATES, np.zeros(20))):
-        assert set(np.round(act(states), 4)) <= set(car.TURN_RATES)
+        assert set(np.round(act(states, np.ones(20, bool)), 4)) <= set(car.TURN_RATES)
+
+
+def test_who_drives_alone_drives_as_beside_others(latent):
+    """Runs that are over are left out of the batch."""
+    together, alone = latent.start(), latent.start()
+    kept = np.arange(20) % 3 > 0
+    together(STATES, np.ones(20, bool))
+    alone(STATES[kept], np.ones(kept.sum(), bool))
+    after = car.step(STATES, np.zeros(20))[kept]
+    np.testing.assert_allclose(together(after, kept), alone(after, np.ones(kept.sum(), bool)), atol=1e-5)
+
+
+@pytest.mark.parametrize("law", [{}, {"lookahead": 0}, {"name": "plan"}])
+def test_the_verdict_is_the_sign_of_v(latent, law):
+    config = latent.model.config
+    before = config.law
+    config.change(law=replace(before, **law))
+    verdicts = torch.cat([latent.safe(z) for z in latent.latents(STATES)])
+    np.testing.assert_array_equal(verdicts.numpy(), latent.value(STATES) > 0)
+    config.change(law=before)
 
 
 def test_value_does_not_depend_on_the_chunk(latent):
@@ -182,10 +208,10 @@ def test_plan_does_not_look_beyond_the_end_of_the_episode(latent, monkeypatch):
 
 
 def test_fallback_remembers_within_a_rollout_only(latent):
-    act = latent.start()
-    first = act(STATES)
-    act(STATES + 0.1)
-    np.testing.assert_array_equal(latent.start()(STATES), first)
+    act, all_drive = latent.start(), np.ones(20, bool)
+    first = act(STATES, all_drive)
+    act(STATES + 0.1, all_drive)
+    np.testing.assert_array_equal(latent.start()(STATES, all_drive), first)
 
 
 def test_monitor_sees_what_the_shield_sees(latent, policy):

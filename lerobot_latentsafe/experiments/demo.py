@@ -17,7 +17,7 @@ from lerobot_latentsafe.reports import html
 
 SIDE_BY_SIDE = "bare | shielded; orange: the filter acts"
 NO_GUARANTEE = "A learned filter is not a certified safety device: it carries no guarantee."
-ENVIRONMENT = {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", "TQDM_DISABLE": "1"}
+ENVIRONMENT = {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", "TQDM_DISABLE": "1", "DIFFUSERS_VERBOSITY": "error"}
 STARTING = "starting Python and LeRobot, once"
 
 
@@ -29,13 +29,14 @@ class Demo:
     Args:
         out: folder, new, for logs and whatever the commands write.
         modules: what they need. None of them may have drawn: MuJoCo does not draw in a process that was forked then.
+        usual: step -> minutes of CPU time that it usually takes, for the progress bar.
 
     Attributes:
         minutes: step -> minutes of CPU time that it took.
     """
 
-    def __init__(self, out: Path, modules: Sequence[str] = ()):
-        self.out, self.started = out, time.time()
+    def __init__(self, out: Path, modules: Sequence[str] = (), usual: dict[str, float] | None = None):
+        self.out, self.started, self.usual = out, time.time(), usual or {}
         self.minutes: dict[str, float] = {}
         (out / "logs").mkdir(parents=True)
         os.environ.update(ENVIRONMENT)
@@ -56,12 +57,18 @@ class Demo:
         step = what.split(":")[0]
         log = self.out / "logs" / f"{step.replace(' ', '_')}.log"
         log.touch()
-        print(f"[{self.seconds:4.0f} s] {what}", flush=True)
+        self.say(what)
         answer = self._asked(run_command, log, *command)
         self.minutes[step] = self.minutes.get(step, 0.0) + (answer or 0.0)
         if answer is None:
             tail = "\n".join(log.read_text().splitlines()[-15:])
             raise SystemExit(f"demo: '{what}' failed; the end of {log}:\n{tail}")
+
+    def say(self, what: str) -> None:
+        """Print a line, after the time and how far the demonstration is."""
+        done, all_steps = (sum(self.usual.get(step, 0.0) for step in steps) for steps in (self.minutes, self.usual))
+        bar = f" {progress_bar(done / all_steps)}" if all_steps else ""
+        print(f"[{self.seconds:4.0f} s]{bar} {what}", flush=True)
 
     def finish(self) -> None:
         """Count the time that starting took."""
@@ -128,6 +135,11 @@ def parent_minutes() -> float:
 def _minutes() -> float:
     """CPU time of this process, and of those that it started and that have ended."""
     return sum(os.times()[:4]) / 60
+
+
+def progress_bar(share: float, width: int = 20) -> str:
+    """`[#####...............]  25%` of a share."""
+    return f"[{'#' * round(share * width):.<{width}}] {share:4.0%}"
 
 
 def durations(seconds: float, minutes: dict[str, float]) -> dict[str, float | dict]:

@@ -2,12 +2,14 @@
 
 import json
 import shutil
-import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from statistics import mean
 
 import numpy as np
 
 from lerobot_latentsafe.dubins.ground_truth import grid_states
+from lerobot_latentsafe.evaluation.statistics import provenance, wilson, write_json
 from lerobot_latentsafe.experiments.demo import (
     NO_GUARANTEE,
     SIDE_BY_SIDE,
@@ -26,10 +28,41 @@ MODULES = (
 )
 """What the commands import."""
 CANDIDATES = "[[-1.25,1.0],[0.0,1.0],[1.25,1.0]]"
+N_RANDOM, N_RECKLESS = 500, 60
+"""Episodes."""
+WORLD_MODEL_STEPS, CRITIC_STEPS = 2000, 1000
+"""Of 600 steps, on 250 episodes and 16 pixels, came a filter under which all of 20 runs entered the disc."""
+PROPOSAL_STEPS = 6
+"""Imagined ticks for which a proposal is held: time to turn away."""
+FEW = ("--policy.margin.clips=1000", "--policy.reachability.pool=65536")
+"""What of configs/dubins_rssm.yaml takes long."""
+USUAL_MINUTES = {
+    "collect reckless": 0.2,
+    "cache reckless": 0.1,
+    "train reckless diffusion policy": 0.8,
+    "collect random": 1.5,
+    "cache random": 0.2,
+    "train world model": 2.6,
+    "fit the failure margin": 0.1,
+    "reachability in imagination": 0.4,
+    "wrap": 0.1,
+    "monitor against the exact safe set": 0.5,
+    "bare against shielded": 0.4,
+}
+"""Of CPU time, about, for the progress bar."""
 
 
 class DubinsDemo(Demo):
-    """The car's road from episodes to a shielded policy."""
+    """The car's road from episodes to a shielded policy.
+
+    Args:
+        out: folder, new.
+        seed: of what is recorded and trained.
+    """
+
+    def __init__(self, out: Path, seed: int):
+        super().__init__(out, MODULES, USUAL_MINUTES)
+        self.seed = seed
 
     def data(self, source: str, n: int) -> str:
         """Collect episodes and cache their frames; returns the cache's folder."""
@@ -37,7 +70,7 @@ class DubinsDemo(Demo):
         self.run(
             f"collect {source}: {n} episodes",
             *("latentsafe", "collect", f"--source={source}", f"--dataset.repo_id={repo}"),
-            *(f"--dataset.root={root}", f"--dataset.num_episodes={n}"),
+            *(f"--dataset.root={root}", f"--dataset.num_episodes={n}", f"--seed={self.seed}"),
         )
         self.run(
             f"cache {source}",
@@ -52,23 +85,30 @@ class DubinsDemo(Demo):
         self.run(
             f"train {what}",
             *("lerobot-train", f"--config_path=configs/{config}.yaml", f"--dataset.repo_id=demo/{source}_cache"),
-            *(f"--dataset.root={root}", f"--output_dir={folder}", *options),
+            *(f"--dataset.root={root}", f"--output_dir={folder}", f"--seed={self.seed}", *options),
         )
         return str(folder / "checkpoints" / "last" / "pretrained_model")
 
     def filter(self) -> str:
-        """Collect, cache, train the world model and the safety critic, set epsilon."""
-        root = self.data("random", 500)
+        """Collect, cache, train the world model, the failure margin and the safety critic; returns its folder."""
+        root, margin, critic = self.data("random", N_RANDOM), f"{self.out}/margin", f"{self.out}/critic"
+        cached = "--dataset.repo_id=demo/random_cache", f"--dataset.root={root}"
         checkpoint = self.train(
-            "world model and margin", "dubins_rssm", "random", root, f"--policy.frame_cache={root}",
-            f"--policy.fallback.action_candidates={CANDIDATES}", "--steps=2000", "--policy.scheduler_steps=2000",
+            "world model", "dubins_rssm", "random", root, f"--policy.frame_cache={root}",
+            f"--policy.fallback.action_candidates={CANDIDATES}", f"--steps={WORLD_MODEL_STEPS}",
+            f"--policy.scheduler_steps={WORLD_MODEL_STEPS}", *FEW,
         )  # fmt: skip
+        self.run(  # anew, for that one tells a sure margin from a surer one, by which a fallback is chosen
+            "fit the failure margin",
+            *("latentsafe", "train-margin", f"--policy.path={checkpoint}", *cached),
+            *(f"--output_dir={margin}", f"--seed={self.seed}"),
+        )
         self.run(
             "reachability in imagination",
-            *("latentsafe", "train-reachability", f"--policy.path={checkpoint}", f"--output_dir={self.out}/critic"),
-            *("--dataset.repo_id=demo/random_cache", f"--dataset.root={root}", "--steps=4000"),
+            *("latentsafe", "train-reachability", f"--policy.path={margin}", *cached),
+            *(f"--output_dir={critic}", f"--steps={CRITIC_STEPS}", f"--seeds=[{self.seed}]"),
         )
-        return f"{self.out}/critic"
+        return critic
 
     def shield(self, critic: str, base: str, epsilon: float, n_episodes: int) -> None:
         """Wrap filter and policy, compare the filter with the exact safe set, and drive bare and shielded."""
@@ -76,9 +116,9 @@ class DubinsDemo(Demo):
         self.run(
             "wrap",
             *("latentsafe", "wrap", f"--policy.path={critic}", f"--base_policy_path={base}"),
-            *(f"--law.epsilon={epsilon}", "--law.proposal_steps=9", f"--output_dir={out}/shielded"),
+            *(f"--law.epsilon={epsilon}", f"--law.proposal_steps={PROPOSAL_STEPS}", f"--output_dir={out}/shielded"),
         )
-        np.save(out / "states.npy", grid_states()[::29])  # enough for a demonstration's three digits
+        np.save(out / "states.npy", grid_states()[::61])  # enough for a demonstration's two digits
         self.run(
             "monitor against the exact safe set",
             *("latentsafe", "eval-monitor", f"--policy.path={out}/shielded", "--env.type=latentsafe_dubins"),
@@ -92,33 +132,31 @@ class DubinsDemo(Demo):
         )
 
     def reckless(self) -> str:
-        """Collect reckless demonstrations and train a diffusion policy on them."""
-        root = self.data("reckless", 60)
+        """Collect reckless demonstrations and train a diffusion policy on them; returns its folder."""
+        root = self.data("reckless", N_RECKLESS)
         return self.train("reckless diffusion policy", "dubins_diffusion", "reckless", root, "--steps=400")
 
 
-def run_demo(out: Path, epsilon: float, n_episodes: int) -> None:
+def run_demo(out: Path, epsilon: float, n_episodes: int, seed: int = 0) -> None:
     """Make the filter and the policy, compare, and write report.html and metrics.json.
 
     Args:
         out: folder; what is there is deleted.
         epsilon: the filter acts where V <= epsilon.
         n_episodes: starts, bare and shielded.
+        seed: of what is recorded and trained. The starts are always the same.
     """
     if out.exists():
         shutil.rmtree(out)
-    demo = DubinsDemo(out, MODULES)
+    demo = DubinsDemo(out, seed)
     # Two cores, two branches: the policy to be shielded is trained beside the filter.
-    found: dict[str, str] = {}
-    branch = threading.Thread(target=lambda: found.update(base=demo.reckless()))
-    branch.start()
-    critic = demo.filter()
-    branch.join()
-    if "base" not in found:
-        raise SystemExit("demo: the reckless policy could not be trained; see the message above")
-    demo.shield(critic, found["base"], epsilon, n_episodes)
+    with ThreadPoolExecutor(1) as beside:
+        base = beside.submit(demo.reckless)
+        critic = demo.filter()
+        demo.shield(critic, base.result(), epsilon, n_episodes)
     demo.finish()
-    report(out, demo.seconds, demo.minutes)
+    demo.say("write the report")
+    report(out, seed, demo.seconds, demo.minutes)
 
 
 HEADER = ["diffusion policy", "safe success", "violation", "stall"]
@@ -129,15 +167,15 @@ SCORES = {
 }
 
 
-def report(out: Path, seconds: float, minutes: dict[str, float]) -> None:
+def report(out: Path, seed: int, seconds: float, minutes: dict[str, float]) -> None:
     """Print the table; write metrics.json and report.html."""
     shield, monitor = (json.loads((out / f"{name}.json").read_text()) for name in ("shield", "monitor"))
     rows = [
         [name, *(rate_in_words(shield[name][key]) for key in ("success", "violation", "stall"))]
         for name in ("bare", "shielded")
     ]
-    metrics = headline_numbers(shield, monitor, seconds, minutes)
-    (out / "metrics.json").write_text(json.dumps(metrics, indent=2))
+    metrics = {**provenance([seed]), **headline_numbers(shield, monitor), **durations(seconds, minutes)}
+    write_json(out / "metrics.json", metrics)
     scores = [[name, f"{monitor[key]:.3f}"] for name, key in SCORES.items()]
     html.write_report(
         out / "report.html",
@@ -153,7 +191,7 @@ def report(out: Path, seconds: float, minutes: dict[str, float]) -> None:
     print(told(out, metrics))
 
 
-def headline_numbers(shield: dict, monitor: dict, seconds: float, minutes: dict[str, float]) -> dict:
+def headline_numbers(shield: dict, monitor: dict) -> dict:
     """What metrics.json holds, of what eval-shield and eval-monitor wrote."""
     rates = {f"{name}_{key}": shield[name][key] for name in ("bare", "shielded") for key in ("violation", "success")}
     return {
@@ -162,7 +200,6 @@ def headline_numbers(shield: dict, monitor: dict, seconds: float, minutes: dict[
         "significant": bool(shield["violation_p_value"] < 0.05),
         "overridden_share": shield["shielded"]["overridden_share"],
         **{key: monitor[key] for key in ("f1_safe", "f1_unsafe", "balanced_accuracy", "safe_policy")},
-        **durations(seconds, minutes),
     }
 
 
@@ -190,3 +227,28 @@ def page(out: Path, rows: list[list[str]], scores: list[list[str]], metrics: dic
             f"This is a small training for a demonstration; results/ holds the full one. {NO_GUARANTEE}", note=True
         ),
     ]
+
+
+def pool_runs(folders: list[Path], path: Path) -> None:
+    """Write what several demonstrations measured, as one table: rates of all their runs, and mean minutes.
+
+    Args:
+        folders: of demonstrations of different seeds that have run.
+        path: of the table, .json.
+
+    Raises:
+        ValueError: two are of one seed, or of different commits.
+    """
+    found = [json.loads((folder / "metrics.json").read_text()) for folder in folders]
+    seeds, commits = [run["seeds"][0] for run in found], sorted({run["commit"] for run in found})
+    if len({*seeds}) < len(seeds) or len(commits) > 1:
+        raise ValueError(f"seeds {seeds} of commits {', '.join(commits)}; expected each seed once, all of one commit")
+    rates = ("bare_violation", "bare_success", "shielded_violation", "shielded_success")
+    pooled = {name: wilson(*(sum(run[name][part] for run in found) for part in "kn")) for name in rates}
+    minutes = [run["cpu_minutes"] for run in found]
+    spent = {step: round(mean(run["cpu_minutes_of"][step] for run in found), 2) for step in found[0]["cpu_minutes_of"]}
+    made = {**provenance(seeds, sum(minutes)), "commit": commits[0]}
+    write_json(
+        path,
+        {**pooled, "mean_cpu_minutes": round(mean(minutes), 2), "mean_cpu_minutes_of": spent, **made, "runs": found},
+    )

@@ -10,7 +10,7 @@ from lerobot_latentsafe.evaluation.rollouts import Episodes
 from lerobot_latentsafe.experiments.dubins.monitor import Monitor
 
 
-def value_slices(monitors: dict[str, Monitor], turn_rates=tuple(car.TURN_RATES), n: int = 71) -> Figure:
+def value_slices(monitors: dict[str, Monitor], turn_rates=tuple(car.TURN_RATES), n: int = 51) -> Figure:
     """V over (x, y) at headings 0 and 90 degrees, its zero level against the exact one (the paper's figure)."""
     headings = (0.0, np.pi / 2)
     figure, axes = plt.subplots(len(monitors), 2, figsize=(8.4, 3.9 * len(monitors)), squeeze=False)

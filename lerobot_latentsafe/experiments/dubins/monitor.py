@@ -13,12 +13,13 @@ from lerobot_latentsafe.dubins.ground_truth import exact_value
 from lerobot_latentsafe.evaluation.rollouts import Choice, steps
 from lerobot_latentsafe.evaluation.statistics import confusion
 from lerobot_latentsafe.experiments.dubins.privileged import DubinsImagination
-from lerobot_latentsafe.latent import Latent
+from lerobot_latentsafe.latent import Latent, select
 from lerobot_latentsafe.reachability import look_ahead
 from lerobot_latentsafe.safety_model import SafetyModel
 
-Driver = Callable[[np.ndarray], np.ndarray]
-"""Called with the current states (N, 3) at each tick, gives turn rates (N,)."""
+Driver = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Called at each tick with the states (M, 3) of the cars that still drive, and with bool (L,), which of the L of the
+tick before they are; gives turn rates (M,)."""
 
 
 class Monitor(Protocol):
@@ -55,6 +56,22 @@ class LatentMonitor:
         return torch.cat(parts).cpu().numpy()
 
     @torch.no_grad()
+    def safe(self, latent: Latent) -> Tensor:
+        """Whether V > 0 of latents: bool (B,), at a third of the cost of V.
+
+        V is the best of several ways to go on. Where the critic's is safe, or l has failed, the others change nothing.
+        """
+        model, law = self.model, self.model.config.law
+        if law.critic is None:
+            return model.value(latent) > 0
+        imagination, horizon = model.imagination, model.config.world_model.steps(law.lookahead)
+        value = look_ahead(imagination, latent, model.units.still[:0], horizon, model.critic)[0]
+        open_still = (value <= 0) & (imagination.margin(latent) > 0)
+        if open_still.any():
+            value[open_still] = model.value(select(latent, open_still))
+        return value > 0
+
+    @torch.no_grad()
     def margin(self, states: np.ndarray) -> np.ndarray:
         """Bounded margin l: what the failure classifier alone would say."""
         parts = [self.model.imagination.margin(latent) for latent in self.latents(states)]
@@ -85,8 +102,11 @@ class LatentMonitor:
         model, latent, action = self.model, None, None
 
         @torch.no_grad()
-        def act(states: np.ndarray) -> np.ndarray:
+        def act(states: np.ndarray, kept: np.ndarray) -> np.ndarray:
             nonlocal latent, action
+            if latent is not None:
+                rows = torch.from_numpy(kept).to(model.device)
+                latent, action = select(latent, rows), action[rows]
             latent = model.world_model.observe(latent, action, *self._see(states))
             action = choose(latent)
             return model.units.denormalise_action(action).cpu().numpy()[:, 0]
@@ -116,7 +136,7 @@ class PrivilegedMonitor:
         """The critic's policy."""
 
         @torch.no_grad()
-        def act(states: np.ndarray) -> np.ndarray:
+        def act(states: np.ndarray, _: np.ndarray) -> np.ndarray:
             features = self.imagination.features({"state": torch.from_numpy(states).float()})
             return car.MAX_TURN_RATE * self.critic.fallback(features).numpy()[:, 0]
 
@@ -167,33 +187,38 @@ def boundary_starts(n: int, seed: int, low: float = 0.0, high: float = 0.05) -> 
 
 
 class CarWorld:
-    """The car in many states side by side; one that has left the camera's view stays there, and its run is over.
+    """The car in many states side by side; one that has failed or left the camera's view stays there: its run is over.
 
-    Actors see states (N, 3) and choose turn rates (N,).
+    Actors see the states (M, 3) of those that still drive, and bool (L,), which of the L of the tick before they are.
+    They choose turn rates (M,).
 
     Attributes:
-        info: the states, and which of them are failures in view: bool (N,).
+        info: all states (N, 3), and which of them are failures in view: bool (N,).
     """
 
     def __init__(self, starts: np.ndarray, n_steps: int):
-        self.left, self._visible = n_steps, np.ones(len(starts), bool)
+        self.left, self._drives = n_steps, np.ones(len(starts), bool)
+        self._kept = self._drives
         self.info = (starts.copy(), np.zeros(len(starts), bool))
 
     @property
     def over(self) -> np.ndarray:
-        """Which are out of view, or all after the last step: bool (N,)."""
-        return ~self._visible | (self.left == 0)
+        """Which have failed or are out of view, or all after the last step: bool (N,)."""
+        return ~self._drives | (self.left == 0)
 
-    def observe(self) -> np.ndarray:
-        """The states."""
-        return self.info[0]
+    def observe(self) -> tuple[np.ndarray, np.ndarray]:
+        """What an actor sees."""
+        return self.info[0][self._drives], self._kept
 
     def step(self, turn_rates: np.ndarray) -> None:
         """Drive on."""
-        states, _ = self.info
-        states = np.where(self._visible[:, None], car.step(states, turn_rates), states)
-        self._visible = self._visible & car.in_view(states)
-        self.info, self.left = (states, self._visible & (car.margin(states) < 0)), self.left - 1
+        states, failing = self.info[0].copy(), self.info[1].copy()
+        states[self._drives] = car.step(states[self._drives], turn_rates)
+        visible = car.in_view(states)
+        failing |= self._drives & visible & (car.margin(states) < 0)
+        before, self._drives = self._drives, self._drives & visible & ~failing
+        self._kept = self._drives[before]
+        self.info, self.left = (states, failing), self.left - 1
 
 
 def safe_policy_rollouts(monitor: Monitor, starts: np.ndarray, n_steps: int = 100) -> dict:
@@ -202,10 +227,9 @@ def safe_policy_rollouts(monitor: Monitor, starts: np.ndarray, n_steps: int = 10
     A run is safe if the car never enters the failure set within `n_steps` while it is in the camera's view;
     a car that has left the view is no longer seen and its run is over.
     """
-    act, failed, trajectory = monitor.start(), np.zeros(len(starts), bool), [starts]
-    for step in steps(CarWorld(starts, n_steps), lambda states: Choice(act(states))):
-        states, failing = step.info
-        failed |= failing
+    act, trajectory, failed = monitor.start(), [starts], np.zeros(len(starts), bool)
+    for step in steps(CarWorld(starts, n_steps), lambda seen: Choice(act(*seen))):
+        states, failed = step.info
         trajectory.append(states)
     return {
         "safe": int((~failed).sum()),

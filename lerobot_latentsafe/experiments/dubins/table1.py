@@ -1,11 +1,13 @@
 """Table 1: monitors and safe policies of the Dubins car against both exact truths, on the paper's grid."""
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from lerobot_latentsafe.critic import ReachabilityConfig
 from lerobot_latentsafe.dubins.ground_truth import exact_value, grid_states, solve_continuous
@@ -21,6 +23,7 @@ from lerobot_latentsafe.experiments.dubins.monitor import (
     safe_policy_rollouts,
 )
 from lerobot_latentsafe.experiments.dubins.privileged import train_privileged
+from lerobot_latentsafe.latent import Latent
 from lerobot_latentsafe.modeling_latentsafe import load_filter
 from lerobot_latentsafe.reports.figures import save
 
@@ -28,9 +31,9 @@ Truths = dict[str, np.ndarray]
 """discrete and continuous -> the exact V of each state (N,)."""
 
 
-def score(value: np.ndarray, truths: Truths) -> dict:
-    """Confusion of verdicts V > 0 with each truth."""
-    return {name: confusion(value > 0, true > 0) for name, true in truths.items()}
+def score(safe: np.ndarray, truths: Truths) -> dict:
+    """Confusion of verdicts, bool (N,), with each truth."""
+    return {name: confusion(safe, true > 0) for name, true in truths.items()}
 
 
 def rollouts(monitor: Monitor) -> dict:
@@ -59,15 +62,21 @@ def latent_rows(path: str, states: np.ndarray, truths: Truths) -> tuple[dict[str
     """The rows of one filter, and its monitor."""
     policy = load_filter(path)
     monitor, law = LatentMonitor(policy.model), policy.config.law
+    seen = list(monitor.latents(states))  # drawn and encoded once, for all rows
+
+    @torch.no_grad()
+    def judged(safe: Callable[[Latent], Tensor]) -> dict:
+        return score(torch.cat([safe(latent) for latent in seen]).numpy(), truths)
+
     policy.config.change(law=replace(law, lookahead=0))
-    critic = {**score(monitor.value(states), truths), **rollouts(monitor)}
+    critic = {**judged(monitor.safe), **rollouts(monitor)}
     policy.config.change(law=law)
-    plan = PlanMonitor(monitor).value(states[::5])  # every fifth state will do for a control
+    plan = PlanMonitor(monitor).value(states[::5]) > 0  # every fifth state will do for a control
     rows = {
-        "latent": {**score(monitor.value(states), truths), **rollouts(monitor)},
+        "latent": {**judged(monitor.safe), **rollouts(monitor)},
         "critic_alone": critic,
         "plan": score(plan, {name: true[::5] for name, true in truths.items()}),
-        "failure_classifier_alone": score(monitor.margin(states), truths),
+        "failure_classifier_alone": judged(lambda latent: policy.model.imagination.margin(latent) > 0),
     }
     return rows, monitor
 
@@ -77,7 +86,7 @@ def privileged_row(seed: int, states: np.ndarray, truths: Truths) -> tuple[dict,
     started = time.process_time()
     monitor = PrivilegedMonitor(*train_privileged(ReachabilityConfig(), seed))
     minutes = (time.process_time() - started) / 60
-    return {**score(monitor.value(states), truths), **rollouts(monitor)}, monitor, minutes
+    return {**score(monitor.value(states) > 0, truths), **rollouts(monitor)}, monitor, minutes
 
 
 def write_table(filters: list[str], seeds: list[int], folder: Path) -> None:
@@ -108,7 +117,7 @@ def write_table(filters: list[str], seeds: list[int], folder: Path) -> None:
         "latent", "critic_alone", "privileged",
     )}  # fmt: skip
     table |= {name: {"seeds": found[name]} for name in ("plan", "failure_classifier_alone")}
-    table["always_safe"] = {"seeds": [score(np.ones(len(states)), truths)]}
+    table["always_safe"] = {"seeds": [score(np.ones(len(states), bool), truths)]}
     header = {"figures": "each row against both truths; safe_policy and boundary are shares of runs that stay safe"}
     record = {**header, **provenance(seeds), "privileged_cpu_minutes": cpu, "rows": table}
     write_json(folder / "table1.json", record)
