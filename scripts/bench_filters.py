@@ -11,6 +11,7 @@ ratios to the first row, of medians and 99th percentiles.
 import argparse
 import json
 import os
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -79,6 +80,11 @@ class Worker:
                 return json.loads(line)
         raise RuntimeError(f"the process that was to decide ended ({self.process.wait()}); its error stands above")
 
+    def end(self) -> None:
+        """Have it end, and wait for that."""
+        self.process.stdin.close()
+        self.process.wait()
+
 
 def differences(values: dict[str, list], filters: list[str]) -> dict[str, dict[str, float]]:
     """How far the decisions of compiled graphs are from torch's: V at most, and how many reasons are others."""
@@ -115,6 +121,9 @@ def main() -> None:
             for name, (times, said) in worker.decide(episode).items():
                 took.setdefault(name, []).extend(times)
                 values.setdefault(name, []).extend(said)
+    for worker in workers:
+        worker.end()
+    spent = resource.getrusage(resource.RUSAGE_CHILDREN)
     rows = {
         name: {q: float(np.quantile(times, share)) for q, share in QUANTILES.items()} for name, times in took.items()
     }
@@ -122,7 +131,7 @@ def main() -> None:
     ratios = {name: {q: row[q] / first[q] for q in QUANTILES} for name, row in rows.items()}
     result = {"milliseconds": rows, "to_the_first": ratios, "onnx_against_torch": differences(values, list(paths))}
     print(json.dumps(result, indent=1))
-    write_json(given.output, {**result, **provenance(seeds=[])})
+    write_json(given.output, {**result, **provenance([], (spent.ru_utime + spent.ru_stime) / 60)})
 
 
 if __name__ == "__main__":
