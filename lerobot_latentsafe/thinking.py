@@ -87,7 +87,8 @@ class Thinking:
     def _answer(self, of: object, given: Numbers) -> Numbers | None:
         """What a graph says; None where torch is to be asked."""
         if self._made_for != self._now():
-            self._say("it is of another law, or of other weights, until the next episode begins")
+            other = "it is of another law, or of other weights, until the next episode begins"
+            self._say("it is made by Shield.warm_up, which nobody called" if self._made_for is None else other)
             return None
         graph = self._graphs.get(of)
         if graph is None or not graph.fits(given):
