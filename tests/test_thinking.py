@@ -7,16 +7,15 @@ import numpy as np
 import pytest
 import tiny
 import torch
+from test_decisions import FILE, FILTERS
 
 from lerobot_latentsafe.decision import LawOptions, Reason
 from lerobot_latentsafe.encoders.perception import Perception
 from lerobot_latentsafe.guard import standing_still
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
-from lerobot_latentsafe.nearest import Nearest
 from lerobot_latentsafe.runtime.hub import save_policy
 from lerobot_latentsafe.runtime.onnx_graph import Graph
 from lerobot_latentsafe.shield import Shield
-from lerobot_latentsafe.thinking import Hold
 
 PICTURE, STATE = "observation.images.front", "observation.state"
 WORLD_MODELS = {
@@ -127,13 +126,32 @@ def test_graphs_decide_as_torch_does(folders, name, law):
 def test_what_the_law_nearest_asks_is_compiled(folders, monkeypatch):
     policy = load(folders("rssm"), **LAWS["nearest"], engine="onnx")
     shield, _ = decide(policy, 1)
-    for hold in (Hold(len(shield.nearest.candidates.offsets) + 18, True), Hold(4, False)):
-        assert hold in shield.nearest.thinking.holds
+    assert [hold.roughly for hold in shield.nearest.thinking.holds] == [True, False]
     monkeypatch.setattr(
         type(policy.model), "value_of_holding", lambda *given, **options: pytest.fail("torch was asked")
     )
-    decision = shield(seen(7), proposed())
-    assert decision.unsafe and isinstance(shield.nearest, Nearest)
+    assert shield(seen(7), proposed()).unsafe
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_graphs_decide_on_recorded_episodes_as_torch_does(name):
+    with np.load(FILE) as file:
+        inputs = [key for key in file if key.startswith(f"{name}/") and key.count("/") == 1]
+        rows = {key.removeprefix(f"{name}/"): file[key][:, :1] for key in inputs}
+    said = {}
+    for engine in ("torch", "onnx"):
+        policy = load_filter(name, law=LawOptions(engine=engine))
+        shield = Shield(policy.model, clock=standing_still)
+        shield.warm_up()
+        assert shield.nearest.thinking.compiled == (engine == "onnx")
+        said[engine] = []
+        for t, action in enumerate(torch.from_numpy(rows["action"])):
+            scale = {key: 255 if value.dtype == np.uint8 else 1 for key, value in rows.items()}
+            shown = {key: torch.from_numpy(value[t]).float() / scale[key] for key, value in rows.items()}
+            said[engine].append(shield({key: value for key, value in shown.items() if key != "action"}, action))
+    for one, other in zip(said["torch"], said["onnx"]):
+        assert torch.equal(one.reason, other.reason)
+        torch.testing.assert_close(one.value, other.value, atol=1e-4, rtol=0)
 
 
 # -- what is no number stays none ---
