@@ -12,6 +12,7 @@ LAWS = ("reachability", "nearest", "risk", "plan", "margin", "guard")
 CRITICS = {"reachability": "reachability", "nearest": "reachability", "risk": "risk"}
 """Laws that read a critic -> what that must have been trained for."""
 MODES = ("filter", "monitor")
+ENGINES = ("torch", "onnx")
 ANSWERS = ("warn", "slow", "hold", "hand_over")
 """What may be done about what is unknown."""
 SLOW = 0.5
@@ -80,6 +81,8 @@ class LawOptions:
     """By so much an observation may be older than a period when the action leaves."""
     mode: str | None = None
     """filter, or monitor, which never acts and reports what it would have done."""
+    engine: str | None = None
+    """What computes: torch, or graphs of ONNX Runtime, which take half the time or less (for one robot on the CPU)."""
     unknown: str | None = None
     """What is done where the monitor of the unknown alarms: warn, slow, hold or hand_over."""
 
@@ -119,6 +122,9 @@ class LawConfig:
         slack_ms: by so much an observation may be older than a period of the data's rate when the action leaves.
             Beyond that nothing passes.
         mode: `filter` overrides unsafe actions; `monitor` only reports what it would have done.
+        engine: what computes a decision: `torch`; or `onnx`, graphs that ONNX Runtime runs in half the time or less,
+            for one robot on the CPU. They are made when the filter is loaded, in seconds, and are compared with torch,
+            which decides wherever there is none. V is the same to four digits.
         unknown: what is done where the monitor of the unknown alarms, of a filter that has one. `hold` takes it for a
             fault: the robot stays, or the fallback acts where staying is not found safe. `hand_over` does the same, and
             the decision asks for a person. `slow` lets half of each motion pass, `warn` all of it. Each of them warns.
@@ -139,12 +145,14 @@ class LawConfig:
     deadline_ms: float | None = None
     slack_ms: float = 0.0
     mode: str = "filter"
+    engine: str = "torch"
     unknown: str = "hold"
 
     def __post_init__(self) -> None:
         expected = {
             "name": (self.name in LAWS, f"one of {', '.join(LAWS)}"),
             "mode": (self.mode in MODES, f"one of {', '.join(MODES)}"),
+            "engine": (self.engine in ENGINES, f"one of {', '.join(ENGINES)}"),
             "unknown": (self.unknown in ANSWERS, f"one of {', '.join(ANSWERS)}"),
             "lookahead": (0 <= self.lookahead <= 25, "0 (critic alone) to 25 imagined ticks"),
             "proposal_steps": (1 <= self.proposal_steps <= 25, "1 (the paper's law) to 25 steps"),
@@ -209,7 +217,7 @@ class LawConfig:
         stricter = all(getattr(self, name) >= getattr(other, name) for name in ordered)
         in_time = other.deadline_ms is None or (self.deadline_ms is not None and self.deadline_ms <= other.deadline_ms)
         in_time &= self.slack_ms <= other.slack_ms
-        free = [*ordered, "deadline_ms", "slack_ms", "mode", "kappa", "replan_above"]
+        free = [*ordered, "deadline_ms", "slack_ms", "mode", "engine", "kappa", "replan_above"]
         free += ["name"] if self.critic is not None and self.critic == other.critic else []
         alike = replace(self, **{name: getattr(other, name) for name in free}) == other
         return self.mode == "filter" and alike and stricter and in_time

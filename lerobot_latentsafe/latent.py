@@ -50,18 +50,22 @@ class Belief:
     younger: Latent | None = None
     n_frames: int = 0
 
+    def led_on(self, history_frames: int = 0) -> list[Latent | None]:
+        """The latents that the next frame leads on, of which it makes the next belief; None: an episode begins there.
+
+        Args:
+            history_frames: frames to remember at most, and at least half as many; 0: all.
+        """
+        half = history_frames // 2
+        if not half:
+            return [self.latent]
+        return [self.younger, None] if self.n_frames % half == 0 else [self.latent, self.younger]
+
     def after(self, observe: Callable[[Latent | None], Latent], history_frames: int = 0) -> "Belief":
         """One frame on.
 
         Args:
             observe: posterior, or None at the start -> that after the frame.
-            history_frames: frames to remember at most, and at least half as many; 0: all.
+            history_frames: see `led_on`.
         """
-        half = history_frames // 2
-        if not half:
-            latent, younger = observe(self.latent), None
-        elif self.n_frames % half == 0:
-            latent, younger = observe(self.younger), observe(None)
-        else:
-            latent, younger = observe(self.latent), observe(self.younger)
-        return Belief(latent, younger, self.n_frames + 1)
+        return Belief(*map(observe, self.led_on(history_frames)), n_frames=self.n_frames + 1)

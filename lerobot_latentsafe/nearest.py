@@ -12,9 +12,10 @@ import torch
 
 from lerobot_latentsafe.decision import FilterDecision
 from lerobot_latentsafe.host import all_of, on_host
-from lerobot_latentsafe.latent import Latent, map_latent
+from lerobot_latentsafe.latent import Latent
 from lerobot_latentsafe.limits import Limits
 from lerobot_latentsafe.safety_model import SafetyModel
+from lerobot_latentsafe.thinking import Hold, Thinking
 from lerobot_latentsafe.units import Units
 
 BLENDS = 8
@@ -99,16 +100,16 @@ class Candidates:
         wide = np.linspace(WIDEST / DRAWS, WIDEST, DRAWS)[:, None]
         draws = np.random.default_rng(seed).standard_normal((DRAWS, len(varies))) * wide
         self.offsets = (draws * self.half_range * self.moves).astype(np.float32)
-        self._dropped = np.eye(len(varies), dtype=bool)[varies]
-        self._reversed = np.eye(len(varies), dtype=bool)[self.moves]
+        self.dropped = np.eye(len(varies), dtype=bool)[varies]
+        self.reversed = np.eye(len(varies), dtype=bool)[self.moves]
 
     def beside(self, asked: Asked) -> np.ndarray:
         """Candidates (N, R, A) in robot units. To drop a command is to stay; switches and grips are never reversed."""
         proposed, hold = asked.proposed[None], asked.hold[None]
         share = (np.arange(1, BLENDS + 1, dtype=np.float32) / (BLENDS + 1))[:, None, None]
         blends = np.where(self.moves, proposed + share * (asked.fallback - proposed), proposed)
-        dropped = np.where(self._dropped[:, None], hold, proposed)
-        reverse = np.where(self._reversed[:, None], 2 * hold - proposed, proposed)
+        dropped = np.where(self.dropped[:, None], hold, proposed)
+        reverse = np.where(self.reversed[:, None], 2 * hold - proposed, proposed)
         return np.concatenate([proposed, blends, dropped, reverse, proposed + self.offsets[:, None]])
 
     def along(self, asked: Asked, candidates: np.ndarray, value: np.ndarray) -> np.ndarray:
@@ -138,11 +139,16 @@ class Nearest:
 
     Args:
         model: a trained safety model, and by its configuration the law.
+
+    Attributes:
+        thinking: asks the model.
     """
 
     def __init__(self, model: SafetyModel):
         self.model, self.candidates = model, Candidates(model.units, model.limits)
         self.distance = self.candidates.distance
+        n = 1 + BLENDS + len(self.candidates.dropped) + len(self.candidates.reversed) + DRAWS
+        self.thinking = Thinking(model, [Hold(n, True), Hold(SHORTLIST + len(PROJECTIONS), False)])
 
     def find(self, asked: Asked) -> Found:
         """The nearest action that passes, judged as any proposal is."""
@@ -174,8 +180,7 @@ class Nearest:
         known = np.where(np.isfinite(actions), actions, asked.hold).reshape(n * rows, size)
         at = model.tensor(np.tile(asked.pose, (n, 1))) if model.units.has_targets else None
         heard = model.units.heard_action(model.tensor(known), at).nan_to_num(0.0)
-        latent = map_latent(asked.latent, lambda t: t.repeat(n, *[1] * (t.dim() - 1)))
-        return on_host(model.value_of_holding(latent, heard, roughly)).reshape(n, rows)
+        return on_host(self.thinking.hold(asked.latent, heard, roughly)).reshape(n, rows)
 
 
 def shortlist(

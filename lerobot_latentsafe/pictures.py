@@ -1,6 +1,7 @@
 """What every path into a world model does to pictures, and which pictures it refuses."""
 
 import functools
+import math
 
 import numpy as np
 import torch
@@ -28,8 +29,17 @@ def averaged(images: Tensor, size: int) -> Tensor:
     """Float pictures (..., H, W), area-averaged to (..., size, size)."""
     if images.shape[-2:] == (size, size):
         return images
-    rows, columns = (_averages(n, size).to(images) for n in images.shape[-2:])
-    return rows @ images @ columns.T
+    return _averaged_rows(_averaged_rows(images, size).mT, size).mT
+
+
+def _averaged_rows(images: Tensor, size: int) -> Tensor:
+    """Pictures (..., H, W), area-averaged to (..., size, W).
+
+    Where both are many times some number of rows, 224 and 96 are 32 times 7 and 3, each such part is averaged alone.
+    """
+    n_parts = math.gcd(images.shape[-2], size)
+    parts = images.unflatten(-2, (n_parts, -1))
+    return (_averages(parts.shape[-2], size // n_parts).to(images) @ parts).flatten(-3, -2)
 
 
 @functools.cache

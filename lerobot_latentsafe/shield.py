@@ -6,6 +6,7 @@ in range and familiar ever counts as safe; and whatever fails, there is a decisi
 
 import logging
 import math
+import statistics
 import threading
 import time
 import weakref
@@ -33,15 +34,19 @@ from lerobot_latentsafe.decision import (
 )
 from lerobot_latentsafe.guard import UNSEEN, Guard, Pace, Seen
 from lerobot_latentsafe.host import on_host
-from lerobot_latentsafe.latent import Belief, Latent, is_sound, replace_rows, select
+from lerobot_latentsafe.latent import Belief, Latent, is_sound, map_latent, select
 from lerobot_latentsafe.nearest import Asked, Found, Nearest
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
 from lerobot_latentsafe.runtime.time_limit import TimeLimit
 from lerobot_latentsafe.safety_model import SafetyModel
+from lerobot_latentsafe.tick import Frame, Thought, together
 from lerobot_latentsafe.unknown.dynamics import Foretold, ages
 from lerobot_latentsafe.unknown.monitor import UnknownMonitor
 
 logger = logging.getLogger(__name__)
+
+TRIALS, USUAL = 5, 0.7
+"""Decisions that are timed before the first one, and the share of a tick that they may take: some take half more."""
 
 
 class Judgement(NamedTuple):
@@ -95,7 +100,7 @@ class Shield:
         self.nearest = Nearest(model)
         self.pace = Pace(model.config.trained_on.fps)
         self.failures: Counter[str] = Counter()
-        self.took_s, self._warm = 0.0, False
+        self.took_s, self._warm, self._knows_its_pace = 0.0, False, False
         self._in_time = TimeLimit(model.device.type)
         self._lock = threading.RLock()
         self._same_weights: weakref.WeakKeyDictionary[Shield, bool] = weakref.WeakKeyDictionary()
@@ -123,7 +128,7 @@ class Shield:
         self.beliefs = deque([Belief()] * skip, maxlen=skip)
         self.foretold = deque([Foretold()] * skip, maxlen=skip)
         self._in_sight: np.ndarray | None = None
-        self._told_at: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=skip)
+        self._told: deque[Tensor] = deque(maxlen=skip)
         self.observed: dict[str, Tensor] | None = None
         self.decision: FilterDecision | None = None
         self.overrides: Overrides | None = None
@@ -132,22 +137,52 @@ class Shield:
 
     @torch.no_grad()
     def warm_up(self) -> None:
-        """Judge nothing once, between episodes, so that the first decision is no slower than the others."""
-        if not self.model.is_trained_for_law() or self._warm:
+        """Between episodes: compile what the law wants compiled, and judge nothing once, so that no tick is slow."""
+        if not self.model.is_trained_for_law():
             return
         drawn_elsewhere = torch.random.fork_rng([self.model.device] if self.model.device.type == "cuda" else [])
         with self._lock, self.model.single_precision(), drawn_elsewhere:
-            model, size = self.model, self.model.config.world_model.image_size
-            images = {key: torch.zeros(1, 3, size, size, device=model.device) for key in self.guard.cameras.keys}
-            self.guard.pose = on_host(model.units.state_mean[None])
-            hold, fault = np.nan_to_num(model.limits.hold(self.guard.pose), nan=0.0), np.zeros(1, np.int64)
-            self.overrides = Overrides(1)
-            # In the thread that decides later on, as what is made at first use is made for each thread.
-            seconds = None if self.patience() is None else math.inf
-            ahead = self._hear_ahead(self._hear(hold, self.guard.pose), fault)
-            self._judge(Seen(images, self.guard.pose, fault), fault, hold, ahead, hold, seconds)
-            self._warm = True
-            self._forget()
+            self.nearest.thinking.prepare(self._grey(0.0))
+            if not self._warm:
+                self._rehearse(0.0)
+                self._warm = True
+            if self.pace.strict and not self._knows_its_pace and self.patience() is not None:
+                self._say_if_late(statistics.median(self._rehearse((i + 1) / TRIALS) for i in range(TRIALS)))
+                self._knows_its_pace = True
+
+    def _grey(self, shade: float) -> dict[str, Tensor]:
+        """Pictures for the world model, for one robot, of one shade in [0, 1]."""
+        size = self.model.config.world_model.image_size
+        return {key: torch.full((1, 3, size, size), shade, device=self.model.device) for key in self.guard.cameras.keys}
+
+    def _rehearse(self, shade: float) -> float:
+        """Judge nothing, seeing one shade of grey, and forget it. Returns seconds that it took."""
+        model, fault = self.model, np.zeros(1, np.int64)
+        self.guard.pose = on_host(model.units.state_mean[None])
+        hold, images = np.nan_to_num(model.limits.hold(self.guard.pose), nan=0.0), self._grey(shade)
+        self.overrides = Overrides(1)
+        # In the thread that decides later on, as what is made at first use is made for each thread.
+        seconds = None if self.patience() is None else math.inf
+        ahead = self._hear_ahead(self._hear(hold, self.guard.pose), fault)
+        began = time.perf_counter()
+        self._judge(Seen(images, self.guard.pose, fault), fault, hold, ahead, hold, seconds)
+        took = time.perf_counter() - began
+        self._forget()
+        return took
+
+    def _say_if_late(self, took: float) -> None:
+        """Warn of a machine that is too slow for the robot's rate, before it moves.
+
+        Args:
+            took: seconds of what is most of a tick.
+        """
+        limit = min(self.patience(), (self.model.config.law.deadline_ms or math.inf) / 1e3)
+        if took > USUAL * limit:
+            logger.warning(
+                "THIS ROBOT WILL BE LATE: to see and to imagine takes %.0f ms here, and a whole tick may take %.0f. "
+                "Nothing passes in a tick that is late. Give law.engine=onnx, a smaller law.lookahead, or a faster "
+                "machine; latentsafe bench --policy.path=... says which part takes how long", 1e3 * took, 1e3 * limit,
+            )  # fmt: skip
 
     @torch.no_grad()
     def __call__(
@@ -290,10 +325,11 @@ class Shield:
         percepts = self._perceive(seen)
         unsound = ~is_sound(percepts)
         blind = self.model.tensor(np.isin(faults, UNSEEN)) | (self.model.tensor(faults == Reason.PASSED) & unsound)
-        before = self._what_led_here(ahead[:, 0])
-        belief = self._filter_history(percepts, seen.state, before, blind)
-        foretold, differences = self._foretell(belief.latent, before, blind)
-        value, margin, fallback, retreats = self._look_ahead(belief.latent, ahead, hold)
+        led = self._what_led_here(ahead[:, 0])
+        belief, thought = self._think(percepts, seen.state, led, ahead, blind)
+        foretold, differences = self._foretell(belief.latent, led, blind)
+        value, margin = on_host(thought.value), on_host(thought.margin)
+        fallback, retreats = self._fall_back(thought, hold)
         faults = or_else(faults, first_of({Reason.FILTER_FAILED: on_host(unsound, torch.bool)}))
         nearest = self._find_nearest(belief.latent, value, faults, judged, fallback, hold)
         return Judgement(belief, value, margin, fallback, retreats, nearest, foretold, differences), faults
@@ -318,19 +354,25 @@ class Shield:
         differences[(in_sight[:, None] < old) | on_host(blind, torch.bool)[:, None]] = np.nan
         return foretold, differences
 
-    def _look_ahead(self, latent: Latent, ahead: Tensor, hold: np.ndarray) -> tuple[np.ndarray, ...]:
-        """V of actions (B, K, A), l now (B,); the fallback (B, A); whether an override would be the retreat's (B,)."""
-        model = self.model
-        margin = model.imagination.margin(latent)
-        predicted, on_the_way = model.go_on(latent, ahead)
-        both = {key: torch.cat([predicted[key], latent[key]]) for key in latent}  # one pass through imagination
-        sizes = [len(on_the_way), len(hold)]
-        (value, here), (_, action) = (part.split(sizes) for part in model.plan(both))
-        value = model.through(latent, margin, on_the_way, value)
-        retreats, known = self.overrides.retreats(model.config.law), np.isfinite(on_host(here))
+    def _think(
+        self, percepts: Latent, state: np.ndarray, led: Tensor, ahead: Tensor, blind: Tensor
+    ) -> tuple[Belief, Thought]:
+        """What is believed of the episode, and what the models say; robots that are blind (B,) only imagine."""
+        model, before = self.model, self.beliefs[0]
+        shown = model.units.normalise_state(model.tensor(state)).nan_to_num(0.0)
+        memories = before.led_on(model.config.world_model.steps(model.config.law.history_frames))
+        latent, begins = together(memories, model.world_model.initial(len(state)))
+        frame = Frame(percepts, shown, led, ahead)
+        thought = self.nearest.thinking.think(latent, begins, frame, blind if blind.any() else None)
+        parts = [map_latent(thought.latent, lambda t: t[i : i + len(state)]) for i in range(0, len(begins), len(state))]  # noqa: B023
+        return Belief(*parts, n_frames=before.n_frames + 1), thought
+
+    def _fall_back(self, thought: Thought, hold: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The fallback (B, A) in robot units, and whether an override would be the retreat's: (B,)."""
+        retreats, known = self.overrides.retreats(self.model.config.law), np.isfinite(on_host(thought.here))
         moves = retreats & known  # where nothing is known, nothing moves
-        fallback = np.where(moves[:, None], self._retreat(hold), self._usable(action, known, hold))
-        return on_host(value), on_host(margin), fallback, retreats
+        fallback = np.where(moves[:, None], self._retreat(hold), self._usable(thought.action, known, hold))
+        return fallback, retreats
 
     def _find_nearest(
         self, latent: Latent, value: np.ndarray, faults: np.ndarray, proposed: np.ndarray, fallback: np.ndarray,
@@ -396,17 +438,18 @@ class Shield:
     def executed(self) -> list[Tensor]:
         """What the robots were told in the last ticks, as the world model hears it: (B, A) each, the latest last, at
         most as many as a step of the world model takes."""
-        return [self._hear(action, pose) for action, pose in self._told_at]
+        return list(self._told)
 
     def was_executed(self, action: Tensor) -> None:
         """Remember (B, A) in robot units as what was done, where something else was than was decided."""
-        if self._told_at:
-            self._told_at.pop()
+        if self._told:
+            self._told.pop()
         self._was_told(on_host(action).copy())
 
     def _was_told(self, action: np.ndarray) -> None:
         self.guard.was_told(action)
-        self._told_at.append((action, self.guard.pose))
+        if self.model.config.law.name != "guard":  # nobody hears it there
+            self._told.append(self._hear(action, self.guard.pose))
 
     def _hear(self, action: np.ndarray, pose: np.ndarray) -> Tensor:
         """An action (B, A) at a pose (B, S) as the world model hears it; what is not known does not move."""
@@ -485,7 +528,7 @@ class Shield:
             with self._lock, other._lock:
                 if not (other._decided(observation, action) and self._accepts(other)):
                     continue
-                self.beliefs, self._told_at = other.beliefs.copy(), other._told_at.copy()
+                self.beliefs, self._told = other.beliefs.copy(), other._told.copy()
                 self.foretold = other.foretold.copy()
                 for name in ("observed", "decision", "overrides", "_accepted", "_in_sight"):
                     setattr(self, name, getattr(other, name))
@@ -521,25 +564,6 @@ class Shield:
         # Where so many ticks have not been, the belief is a fresh one, and only what counts as first is read of this.
         n_unknown = self.beliefs.maxlen - len(executed)
         return torch.cat([*[executed[0] if executed else heard] * n_unknown, *executed], 1)
-
-    def _filter_history(self, percepts: Latent, state: np.ndarray, before: Tensor, blind: Tensor) -> Belief:
-        """What the world model makes of the episode; of rows that are blind (B,) it goes on by imagination alone."""
-        world_model, units = self.model.world_model, self.model.units
-        shown = units.normalise_state(self.model.tensor(state)).nan_to_num(0.0)
-        first = units.first_action(before)
-
-        def observe(latent: Latent | None) -> Latent:
-            new, led = world_model.initial(len(state)), first
-            if latent is not None:  # what went wrong once must not poison the rest of an episode
-                lost = ~is_sound(latent)
-                new, led = replace_rows(latent, new, where=lost), torch.where(lost[:, None], first, before)
-            if not blind.any():
-                return world_model.observe(new, led, percepts, shown)
-            predicted = world_model.step(new, led)
-            return replace_rows(world_model.correct(predicted, percepts, shown), predicted, where=blind)
-
-        n_frames = self.model.config.world_model.steps(self.model.config.law.history_frames)
-        return self.beliefs[0].after(observe, n_frames)
 
     def _usable(self, action: Tensor, known: np.ndarray, hold: np.ndarray) -> np.ndarray:
         """The safety policy's action in robot units; where it is not finite, or its value is not known, hold."""

@@ -87,6 +87,9 @@ VERBS: dict[str, Verb] = {
         "print the folder of a committed checkpoint, for LeRobot's commands",
         light=True,
     ),
+    "bench": Verb(
+        "deploy", "lerobot_latentsafe.cli.bench", "Bench", "measure what a tick takes on this machine, part by part"
+    ),
     "migrate-checkpoint": Verb(
         "deploy", _DEPLOY, "MigrateCheckpoint", "copy a checkpoint of a version before 0.2 into the present layout"
     ),

@@ -1,5 +1,6 @@
 """What a token world model sees of a frame: a frozen encoder's tokens, their principal components, class tokens."""
 
+import logging
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,6 +11,9 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from lerobot_latentsafe.encoders.patch_encoders import PatchEncoder, Seen, load_encoder
+from lerobot_latentsafe.runtime.onnx_graph import Graph, GraphError
+
+logger = logging.getLogger(__name__)
 
 LIVE = 64
 """So many pictures at most are of robots that act now, and are remembered until the next ones."""
@@ -221,6 +225,9 @@ class Perception(nn.Module):
 
     _latest: ClassVar[dict[tuple, tuple[Tensor, Seen]]] = {}
     """Pictures encoded last, and what was seen: a policy and the filter that shields it look at the same ones."""
+    _graphs: ClassVar[dict[tuple, Graph]] = {}
+    """Compiled encoders, by hash of the weights and shape of the pictures."""
+    _by_graphs: ClassVar[bool] = False
 
     def __init__(self, config: PerceptionConfig, image_keys: list[str], image_size: int | None):
         super().__init__()
@@ -268,10 +275,42 @@ class Perception(nn.Module):
                 return seen
         if self.encoder.mean.device != together.device:  # asking all of its modules at each tick takes milliseconds
             self.encoder.to(together.device)
-        seen = Seen(*(None if part is None else self._side_by_side(part) for part in self.encoder(together)))
+        seen = Seen(*(None if part is None else self._side_by_side(part) for part in self._encoded(together)))
         if len(together) <= LIVE:
             self._latest[key] = together, seen
         return seen
+
+    def _encoded(self, images: Tensor) -> Seen:
+        graph = self._graphs.get((self.encoder_hash, *images.shape)) if self._by_graphs else None
+        if graph is None or images.device.type != "cpu":
+            return self.encoder(images)
+        try:
+            said = graph({"images": images})
+        except Exception as e:
+            self._graphs.clear()
+            logger.warning("THE COMPILED ENCODER FAILED (%s: %s): torch encodes instead", type(e).__name__, e)
+            return self.encoder(images)
+        return Seen(said["tokens"], said.get("class_token"))
+
+    @torch.no_grad()
+    def compile(self, tolerance: float) -> None:
+        """Make a graph that encodes the pictures of one robot, for all that see with this encoder; see `use_graphs`.
+
+        Args:
+            tolerance: what it says may differ from what torch says by so much, of large numbers by this share.
+
+        Raises:
+            GraphError: there is no such graph.
+        """
+        shape = len(self.image_keys), 3, self.image_size, self.image_size
+        if (self.encoder_hash, *shape) in self._graphs:
+            return
+        images = torch.rand(shape, generator=torch.Generator().manual_seed(0))
+        graph = Graph(self.encoder, _say, {"images": images})
+        expected, said = _say(self.encoder, images), graph({"images": images})
+        if not all(torch.allclose(said[key], expected[key], rtol=tolerance, atol=tolerance) for key in expected):
+            raise GraphError(f"encoder {self.config.encoder} says something else as a graph than in torch")
+        self._graphs[self.encoder_hash, *shape] = graph
 
     def _side_by_side(self, tokens: Tensor) -> Tensor:
         """Tokens (n_cameras x B, ..., dim), camera by camera, as (B, ..., n_cameras x dim)."""
@@ -301,6 +340,12 @@ class Perception(nn.Module):
     def forget(cls) -> None:
         """Forget the pictures encoded last."""
         cls._latest.clear()
+
+    @classmethod
+    def use_graphs(cls, use: bool) -> None:
+        """Whether from now on graphs encode in this process, where there are any, for filters and policies alike: a
+        policy and the filter that shields it look at the same pictures, and the first of them encodes."""
+        cls._by_graphs = use
 
     def load_basis(self, file: Path) -> None:
         """What `fit` has found, from a file of a token cache."""
@@ -332,21 +377,29 @@ class Perception(nn.Module):
     def kept(self, seen: Seen, names: Collection[str] | None = None) -> dict[str, Tensor]:
         """What is kept of frames that the encoder saw, or what of that is named."""
         names, kept = self.sizes if names is None else names, {}
+        vector = self.basis(seen.tokens) if "vector" in names else None
         if "tokens" in names:
-            kept["tokens"] = self.cut_down(seen.tokens)
-        if "vector" in names:
-            kept["vector"] = self.basis(seen.tokens)
+            kept["tokens"] = self.cut_down(seen.tokens, vector)
+        if vector is not None:
+            kept["vector"] = vector
         if "class" in names and self.class_scale is not None and seen.class_token is not None:
             kept["class"] = self.class_scale(seen.class_token)
         return kept
 
-    def cut_down(self, tokens: Tensor) -> Tensor:
-        """Tokens (..., P, C), whole or cut down already, as they are kept."""
+    def cut_down(self, tokens: Tensor, vector: Tensor | None = None) -> Tensor:
+        """Tokens (..., P, C), whole or cut down already, as they are kept.
+
+        Args:
+            vector: (..., K), the components of these frames, if they are known.
+        """
         whole = tokens.shape[-1] != self.token_dim
         if not whole or self.patches is None:
             return tokens
         weight, bias = self._said()
-        return self.patches(tokens) - (self.basis(tokens) @ weight + bias).view(*tokens.shape[:-1], -1)
+        vector = self.basis(tokens) if vector is None else vector
+        return self.patches(tokens) - torch.addmm(bias, vector.view(-1, len(weight)), weight).view(
+            *tokens.shape[:-1], -1
+        )
 
     def _said(self) -> tuple[Tensor, Tensor]:
         """What the frame's components, times (K, D), and their mean (D,) tell of all components of its patches.
@@ -363,3 +416,9 @@ class Perception(nn.Module):
             told = self.patches.parts(lifted.unflatten(-1, (self.n_patches, -1))).flatten(1)
             self._known = state, (told[1:] - told[0], told[0])
         return self._known[1]
+
+
+def _say(encoder: PatchEncoder, images: Tensor) -> dict[str, Tensor]:
+    """What an encoder says of images, by name."""
+    said = encoder(images)._asdict()
+    return {name: tensor for name, tensor in said.items() if tensor is not None}

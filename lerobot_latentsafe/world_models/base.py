@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from lerobot_latentsafe.datasets.clips import Clip
 from lerobot_latentsafe.datasets.frame_cache import FrameCacheError
+from lerobot_latentsafe.encoders.perception import Perception
 from lerobot_latentsafe.latent import Latent, replace_rows
 
 
@@ -96,6 +97,10 @@ class WorldModel(nn.Module, abc.ABC):
 
     def tokens_of(self, latent: Latent) -> Tensor | None:
         """The frozen encoder's tokens of the frame that a latent (B, ...) means: (B, P, C), None if it has none."""
+        return None
+
+    def frozen_perception(self) -> Perception | None:
+        """What makes percepts by a frozen encoder; None of a model that sees otherwise."""
         return None
 
     @property

@@ -266,6 +266,10 @@ class DinoWM(TerminationHead):
 
     # -- the model ---
 
+    def frozen_perception(self) -> Perception | None:
+        """The encoder and the components of its tokens; None if it was made for tokens."""
+        return self._perception[0]
+
     @property
     def percept_names(self) -> list[str]:
         """Tokens of the frame, and what of the whole of it a frame token carries."""
@@ -374,7 +378,8 @@ class DinoWM(TerminationHead):
         if m == 1:
             return tokens
         apart = tokens.unflatten(-1, (len(self.image_keys), -1)).unflatten(-3, (rows, m, columns, m))
-        return apart.movedim((-6, -4, -2), (-6, -5, -4)).flatten(-4).flatten(-3, -2)
+        n = apart.dim()  # ONNX counts axes from the front
+        return apart.movedim((n - 6, n - 4, n - 2), (n - 6, n - 5, n - 4)).flatten(-4).flatten(-3, -2)
 
     def _apart(self, tokens: Tensor) -> Tensor:
         """The inverse of `_merged`."""

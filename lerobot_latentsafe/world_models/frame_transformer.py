@@ -27,7 +27,7 @@ class FrameTransformer(nn.Module):
         condition_dim: width of a condition that scales, shifts and gates every layer (AdaLN); None for none.
     """
 
-    angle: Tensor
+    rotation: Tensor
 
     def __init__(
         self, dim: int, depth: int, heads: int, head_dim: int, mlp: int, history: int, condition_dim: int | None = None
@@ -37,8 +37,8 @@ class FrameTransformer(nn.Module):
         self.blocks = nn.ModuleList(_Block(dim, heads, head_dim, mlp, condition_dim) for _ in range(depth))
         self.norm = nn.LayerNorm(dim)
         frequency = ROTARY_BASE ** -(torch.arange(head_dim // 2) / (head_dim // 2))
-        age = torch.arange(history - 1, -1, -1.0)
-        self.register_buffer("angle", age[:, None] * frequency, persistent=False)
+        angle = (torch.arange(history - 1, -1, -1.0)[:, None] * frequency).repeat_interleave(2, -1)  # a pair has one
+        self.register_buffer("rotation", torch.stack([angle.cos(), angle.sin()]), persistent=False)
 
     def forward(
         self, x: Tensor, seen: Tensor, past: list[Tensor] | None = None, condition: Tensor | None = None
@@ -55,8 +55,8 @@ class FrameTransformer(nn.Module):
             (B, T, P, d), and for each layer the keys and values of all H - 1 + T frames, (B, H - 1 + T, P, 2 K).
         """
         past = self.empty_past(len(x), x.shape[2]) if past is None else past
-        x, kept, visible, rotation = self._but_the_last(x, seen, past, condition)
-        x, frames = self.blocks[-1](x, past[-1], visible, rotation, condition)
+        x, kept, visible = self._but_the_last(x, seen, past, condition)
+        x, frames = self.blocks[-1](x, past[-1], visible, self.rotation, condition)
         return self.norm(x), [*kept, frames]
 
     def keep(
@@ -64,29 +64,28 @@ class FrameTransformer(nn.Module):
     ) -> list[Tensor]:
         """The keys and values alone that `forward` returns, which takes no more than a part of the last layer."""
         past = self.empty_past(len(x), x.shape[2]) if past is None else past
-        x, kept, _, _ = self._but_the_last(x, seen, past, condition)
+        x, kept, _ = self._but_the_last(x, seen, past, condition)
         last: _Block = self.blocks[-1]
         return [*kept, last.keep(x, past[-1], condition)]
 
     def _but_the_last(
         self, x: Tensor, seen: Tensor, past: list[Tensor], condition: Tensor | None
-    ) -> tuple[Tensor, list[Tensor], Tensor, Tensor]:
-        """All layers but one: tokens, keys and values; and what each frame may see, and rotations by age."""
+    ) -> tuple[Tensor, list[Tensor], Tensor]:
+        """All layers but one: tokens, keys and values; and what each frame may see."""
         batch, length, n_patches, _ = x.shape
         age = torch.arange(self.history - 1, -1, -1, device=x.device)
         visible = (age < seen[..., None]) | (age == 0)
-        visible = visible.repeat_interleave(n_patches, -1).view(batch * length, 1, 1, -1)
-        rotation = torch.polar(torch.ones_like(self.angle), self.angle)
+        visible = visible[..., None].expand(-1, -1, -1, n_patches).reshape(batch * length, 1, 1, -1)
         kept = []
         for block, before in zip(self.blocks[:-1], past):
-            x, frames = block(x, before, visible, rotation, condition)
+            x, frames = block(x, before, visible, self.rotation, condition)
             kept.append(frames)
-        return x, kept, visible, rotation
+        return x, kept, visible
 
     def empty_past(self, batch_size: int, n_patches: int) -> list[Tensor]:
         """Keys and values before the first frame, which nothing may look at."""
         shape = (batch_size, self.history - 1, n_patches, self.kept_dim)
-        return [self.angle.new_zeros(shape) for _ in self.blocks]
+        return [self.rotation.new_zeros(shape) for _ in self.blocks]
 
 
 class _Block(nn.Module):
@@ -137,7 +136,7 @@ class _Block(nn.Module):
         # (B, T, H, P, 2 K); of a single frame without unfold, whose gradient is slow
         window = kept.unsqueeze(1) if length == 1 else kept.unfold(1, history, 1).movedim(-1, 2)
         key, value = window.reshape(n, history * n_patches, 2, self.heads, -1).unbind(2)
-        key = _rotate(key.unflatten(1, (history, n_patches)), rotation[:, None, None]).flatten(1, 2)
+        key = _rotate(key.unflatten(1, (history, n_patches)), rotation[:, :, None, None]).flatten(1, 2)
         query = query.reshape(n, n_patches, self.heads, -1)
         query, key, value = (t.transpose(1, 2) for t in (query, key, value))
         attended = F.scaled_dot_product_attention(query, key, value, attn_mask=visible)
@@ -145,6 +144,7 @@ class _Block(nn.Module):
 
 
 def _rotate(x: Tensor, rotation: Tensor) -> Tensor:
-    """Turn pairs of numbers in the last axis (..., 2 n) by unit complex numbers (..., n)."""
-    pairs = torch.view_as_complex(x.unflatten(-1, (-1, 2)))
-    return torch.view_as_real(pairs * rotation).flatten(-2)
+    """Turn pairs of numbers in the last axis (..., 2 n) by angles whose cosines and sines are given: (2, ..., 2 n)."""
+    cosine, sine = rotation
+    even, odd = x.unflatten(-1, (-1, 2)).unbind(-1)
+    return torch.addcmul(x * cosine, torch.stack([-odd, even], -1).flatten(-2), sine)

@@ -85,6 +85,10 @@ class FrameGRU(WorldModel):
             last.weight.mul_(0.1)
             last.bias.zero_()
 
+    def frozen_perception(self) -> Perception:
+        """The encoder and the components of its tokens."""
+        return self.perception
+
     @property
     def percept_names(self) -> list[str]:
         """Components of the frame, and its tokens if a summary is learned."""

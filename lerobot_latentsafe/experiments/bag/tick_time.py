@@ -9,6 +9,7 @@ from torch import Tensor
 from tqdm import trange
 
 from lerobot_latentsafe.base_policy import BasePolicy
+from lerobot_latentsafe.decision import LawOptions
 from lerobot_latentsafe.evaluation.rollouts import Choice, steps
 from lerobot_latentsafe.evaluation.statistics import provenance, write_json
 from lerobot_latentsafe.experiments.bag.runs import FIRST_SEED, WARM_UP
@@ -19,9 +20,9 @@ from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
 DENOISING_STEPS = 10
 
 
-def shielded(path: str, base: str, ahead: int) -> LatentSafePolicy:
+def shielded(path: str, base: str, ahead: int, engine: str) -> LatentSafePolicy:
     """A filter over a diffusion policy whose chunks are made so many actions ahead; 0: on the control thread."""
-    policy = load_filter(path)
+    policy = load_filter(path, law=LawOptions(engine=engine))
     policy.attach(BasePolicy.load(base, policy.config.device, ahead))
     policy.base.policy.diffusion.num_inference_steps = DENOISING_STEPS
     return policy
@@ -76,8 +77,11 @@ def write_times(path: str, base: str, ahead: int, n_rounds: int, n_steps: int, o
         n_rounds, n_steps: episodes of each variant, and their length.
     """
     scene = BagScene()
-    on, off = (shielded(path, base, actions) for actions in (0, ahead))
-    variants = {"filter alone": (on, True), "chunks on the control thread": (on, False), "chunks ahead": (off, False)}
+    variants: dict[str, tuple[LatentSafePolicy, bool]] = {}
+    for engine, suffix in (("torch", ""), ("onnx", ", compiled")):
+        on, off = (shielded(path, base, actions, engine) for actions in (0, ahead))
+        alone, here, elsewhere = "filter alone", "chunks on the control thread", "chunks ahead"
+        variants |= {alone + suffix: (on, True), here + suffix: (on, False), elsewhere + suffix: (off, False)}
     ticks: dict[str, list[float]] = {name: [] for name in variants}
     for i in trange(n_rounds, unit="round"):
         for name, (policy, alone) in variants.items():

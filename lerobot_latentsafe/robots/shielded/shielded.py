@@ -68,6 +68,7 @@ class LatentSafeShielded(WrappedRobot):
         check_fit(self.inner, config.filter, self.filter.config, config.fps)
         pace, declared = self.filter.shield.pace, getattr(self.inner, "slack_s", 0.0)
         pace.strict, pace.slack_s = True, declared if config.slack_s is None else config.slack_s
+        self.filter.shield.warm_up()  # once more, as now it is known that what is late is lost
         self.filter.shield.guard.begun = True  # it fits; what is wrong from now on is a fault
         self.journal = Journal(config.journal) if config.journal else None
         self._events, self._lock = LeRobotEvents(), threading.RLock()
