@@ -112,7 +112,7 @@ def test_constraints_that_are_known_count(names):
 
 @pytest.mark.parametrize("apart", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_distance_that_is_none_is_refused(apart):
-    with pytest.raises(ConstraintError, match="x.pos; expected a distance"):
+    with pytest.raises(ConstraintError, match=r"x\.pos; expected a distance"):
         LikenessConfig({"x.pos": apart})
 
 
