@@ -20,7 +20,7 @@ HELD_OUT = 0.1
 
 
 def numbers_named(meta: Any, names: list[str]) -> np.ndarray:
-    """The numbers of these names of all frames of a dataset, whatever feature holds them: (N, m).
+    """The numbers of these names of all frames of a dataset, whatever feature holds them: (N, m - 1).
 
     Args:
         meta: LeRobotDatasetMetadata.
@@ -60,11 +60,11 @@ def fit_likeness(
     """Fit what says where a latent is.
 
     Args:
-        features: (N, D). where: (N, m). held_out: bool (N,), those that are not fitted to.
+        features: (N, D). where: (N, m - 1). held_out: bool (N,), those that are not fitted to.
         noise: on features that are scaled to unit deviation, as imagined ones are never quite right.
 
     Returns:
-        (m,), how far it errs in the median on those held out, as multiples of how far apart alike frames are.
+        (m - 1,), how far it errs in the median on those held out, as multiples of how far apart alike frames are.
     """
     likeness.mean.copy_(features.mean(0))
     likeness.deviation.copy_(features.std(0).clamp(min=1e-3))
@@ -90,11 +90,11 @@ def learn_likeness(
     """Learn where latents are from numbers of the recording.
 
     Args:
-        numbers: (N, m) of all frames of the dataset, see `numbers_named`.
+        numbers: (N, m - 1) of all frames of the dataset, see `numbers_named`.
         features, frame: (M, D) and (M,), of windows, and which frame each is.
 
     Returns:
-        The configuration, with the range of the data; and where these windows are (M, m).
+        The configuration, with the range of the data; and where these windows are (M, m - 1).
 
     Raises:
         ConstraintError: the world model does not show a number of it.
@@ -119,7 +119,7 @@ def learn_likeness(
 
 
 def with_random_sets(starts: Starts, places: Tensor, generator: torch.Generator) -> Starts:
-    """Starts of imagination, each with a random set of prototypes at places of the data (N, m)."""
+    """Starts of imagination, each with a random set of prototypes at places of the data (N, m - 1)."""
     places = places.cpu()
 
     def draw(count: int) -> dict[str, Tensor]:

@@ -8,6 +8,8 @@ margin of a set is the least of its prototypes' margins,
 
 and not the value: V of a set is learned, as one may be able to evade each of two constraints, and not both. So the
 critic reads the set, too (`SetNetwork`), and is trained on random ones.
+
+The filter's own margin is the last number of phi. So the failure that it was trained for is a prototype like others.
 """
 
 import math
@@ -47,6 +49,7 @@ class LikenessConfig:
             knows one failure, and takes no constraints.
         low, high: least and largest of each number in the data, in the order of `alike`.
         known: constraint -> its prototypes; see `Prototype`. Added by `latentsafe add-constraint`.
+        own: the failure that the filter's margin was trained for. The margin is one more number, by this name.
         hidden: width of the network that says where a latent is.
     """
 
@@ -54,9 +57,22 @@ class LikenessConfig:
     low: list[float] = field(default_factory=list)
     high: list[float] = field(default_factory=list)
     known: dict[str, list[Prototype]] = field(default_factory=dict)
+    own: str = "failure"
     hidden: int = 64
 
+    @property
+    def numbers(self) -> dict[str, float]:
+        """Number -> its unit: those of `alike`, and the filter's own margin; none if there are no constraints."""
+        return {**self.alike, self.own: 1.0} if self.alike else {}
+
+    @property
+    def own_failure(self) -> dict[str, list[Prototype]]:
+        """The constraint whose margin is the filter's own: m = |m + 1| - 1, as no bounded margin is below -1."""
+        return {self.own: [{self.own: [-1.0, 1.0]}]}
+
     def __post_init__(self) -> None:
+        if self.own in self.alike:
+            raise ConstraintError(f"--alike speaks of {self.own}, which is the name of the failure labels")
         for name, apart in self.alike.items():
             if not 0 < apart < math.inf:
                 raise ConstraintError(f"--alike says {apart} of {name}; expected a distance, more than 0")
@@ -94,19 +110,19 @@ class LikenessConfig:
     def tensor(self, names: list[str]) -> Tensor:
         """The set of these constraints: (SLOTS, 2 m), see `margin_of`."""
         counting = [prototype for name in dict.fromkeys(names) for prototype in self.known[name]]
-        empty = [[0.0] * 2 * len(self.alike)] * (SLOTS - len(counting))
+        empty = [[0.0] * 2 * len(self.numbers)] * (SLOTS - len(counting))
         return torch.tensor([*map(self._row, counting), *empty])
 
     def _row(self, prototype: Prototype) -> list[float]:
         nowhere = [0.0, math.inf]
-        ends = [(*prototype.get(name, nowhere), apart) for name, apart in self.alike.items()]
+        ends = [(*prototype.get(name, nowhere), apart) for name, apart in self.numbers.items()]
         return [where / apart for where, _, apart in ends] + [apart / reach for _, reach, apart in ends]
 
     def prototypes(self, failing: np.ndarray, safe: np.ndarray, of: list[str] | None = None) -> list[Prototype]:
         """What tells frames that fail from those that are safe.
 
         Args:
-            failing, safe: (N, m) and (M, m), places as multiples of `alike`; see `cover`.
+            failing, safe: (N, m - 1) and (M, m - 1), places as multiples of `alike`; see `cover`.
             of: the numbers that count; None: all.
 
         Raises:
@@ -127,9 +143,10 @@ class LikenessConfig:
 
 
 class Likeness(nn.Module):
-    """phi: features (..., D) -> where a latent is (..., m), each number as a multiple of how far apart alike ones are.
+    """Features (..., D) -> where a latent is (..., m - 1), each number as a multiple of how far apart alike ones are.
 
-    It is fitted to numbers of the recording, and reads what the world model makes of pictures.
+    It is phi without the filter's own margin. It is fitted to numbers of the recording, and reads what the world model
+    makes of pictures.
     """
 
     mean: Tensor
@@ -169,10 +186,10 @@ def margin_of(where: Tensor, prototypes: Tensor) -> Tensor:
 class Constrained:
     """An imagination whose failures are a set of prototypes: each latent's own, or the one given for all.
 
-    Features are those of the world model (D), where that is (m), and the set (SLOTS x 2 m), side by side.
+    Features are those of the world model (D), phi (m), and the set (SLOTS x 2 m), side by side.
 
     Args:
-        inside: an `Imagination` (see `reachability.py`).
+        inside: an `Imagination` (see `reachability.py`), whose margin is the filter's own.
         active: (SLOTS, 2 m), the set that counts where latents hold none.
     """
 
@@ -190,9 +207,9 @@ class Constrained:
 
     def features(self, latent: Latent) -> Tensor:
         """What actor and critic read: (B, D + m + SLOTS x 2 m)."""
-        features = self.inside.features(latent)
-        prototypes = latent[KEY] if KEY in latent else self.active.expand(*features.shape[:-1], -1, -1)
-        return torch.cat([features, self.likeness(features), prototypes.flatten(-2)], -1)
+        features, own = self.inside.judged(latent)
+        prototypes = latent[KEY] if KEY in latent else self.active.expand(*own.shape, -1, -1)
+        return torch.cat([features, self.likeness(features), own.unsqueeze(-1), prototypes.flatten(-2)], -1)
 
     def margin(self, latent: Latent) -> Tensor:
         """Bounded margin of the set: (B,)."""
@@ -201,8 +218,8 @@ class Constrained:
     def judged(self, latent: Latent) -> tuple[Tensor, Tensor]:
         """Features and bounded margin (B,), both at once."""
         features = self.features(latent)
-        numbers = self.active.shape[-1] // 2
-        _, where, prototypes = features.tensor_split([-len(self.active.flatten()) - numbers, -self.active.numel()], -1)
+        size, numbers = self.active.numel(), self.active.shape[-1] // 2
+        _, where, prototypes = features.tensor_split([-size - numbers, -size], -1)
         return features, margin_of(where, prototypes.unflatten(-1, self.active.shape))
 
 
@@ -237,9 +254,10 @@ class SetNetwork(nn.Module):
 
 
 def random_sets(places: Tensor, n: int, generator: torch.Generator) -> Tensor:
-    """Sets of 1 to SLOTS prototypes at places of the data (N, m), each of another reach: (n, SLOTS, 2 m).
+    """Sets of 1 to SLOTS prototypes at places of the data (N, m - 1), each of another reach: (n, SLOTS, 2 m).
 
-    Now and then one number of several does not count, as of a line that must not be crossed.
+    Now and then one number of several does not count, as of a line that must not be crossed. In a third of the sets the
+    filter's own failure is one of them.
     """
     numbers = places.shape[1]
     rand = lambda *shape: torch.rand(shape, generator=generator)  # noqa: E731
@@ -249,8 +267,10 @@ def random_sets(places: Tensor, n: int, generator: torch.Generator) -> Tensor:
     left_out = torch.randint(numbers, (n, SLOTS, 1), generator=generator)
     some = (rand(n, SLOTS, 1) < 0.15) & (numbers > 1)
     weight = torch.where(some & (torch.arange(numbers) == left_out), 0.0, weight)
+    own = (rand(n, 1, 1) < 1 / 3) & (torch.arange(SLOTS)[:, None] == 0)  # (n, SLOTS, 1)
+    row = torch.cat([place * ~own, -1.0 * own, weight * ~own, 1.0 * own], -1)
     present = torch.arange(SLOTS) < torch.randint(1, SLOTS + 1, (n, 1), generator=generator)
-    return torch.cat([place, weight], -1) * present[..., None]
+    return row * present[..., None]
 
 
 def cover(failing: np.ndarray, safe: np.ndarray) -> list[tuple[np.ndarray, float]]:

@@ -150,7 +150,7 @@ class SafetyModel(nn.Module):
             candidates = units.normalise_motions(robots)
         bounds = fallback.bounds(units.action_names, units.action_varies & ~units.frozen)
         sizes = self.world_model.feature_dim, len(units.action_low), candidates, self.config.reachability
-        numbers = len(self.config.likeness.alike)
+        numbers = len(self.config.likeness.numbers)
         return SafetyCritic(*sizes, *bounds, self.config.trained_on.target, numbers).to(self.device)
 
     @property

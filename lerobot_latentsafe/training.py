@@ -25,7 +25,6 @@ from lerobot_latentsafe.critic import BACKUPS
 from lerobot_latentsafe.datasets.adoption import adopt_dataset
 from lerobot_latentsafe.datasets.clips import ClipReader, FilterData
 from lerobot_latentsafe.datasets.fingerprints import episode_marks, with_episodes
-from lerobot_latentsafe.datasets.labels import FAILING, SAFE
 from lerobot_latentsafe.latent import Latent, map_latent, select
 from lerobot_latentsafe.margin import FailureMargin, hinge_loss
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
@@ -237,7 +236,7 @@ def train_reachability(
     Args:
         target: what the critic learns: the safety value of Eq. 5, or the `risk` of SQRL.
         alike: number of the recording -> how far apart alike frames may be in it: the critic then takes constraints
-            (see `constraints.py`). The dataset's failure becomes the first of them.
+            (see `constraints.py`). The failure of the margin becomes the first of them.
 
     Several ranks share the work (see `LatentReachability`); the first one saves.
 
@@ -267,7 +266,8 @@ def train_reachability(
     with replacing_folder(output_dir) if rank() == 0 else nullcontext() as folder:
         started = time.process_time()
         numbers = numbers_named(dataset_meta, [*alike]) if alike else None
-        learn_critic(policy, reader, seed, steps, target, LikenessConfig(alike or {}), numbers)
+        likeness = LikenessConfig(alike or {}, own=policy.config.margin.failure_specification)
+        learn_critic(policy, reader, seed, steps, target, likeness, numbers)
         if rank() == 0:
             _save(policy, policy.model.critic, folder, run)
             print(f"reachability: {time.process_time() - started:.0f} CPU-s")
@@ -281,7 +281,7 @@ def learn_critic(
     """Give a filter a trained critic.
 
     Args:
-        likeness, numbers: of a critic that takes constraints, and (N, m) of all frames; see `learn_likeness`.
+        likeness, numbers: of a critic that takes constraints, and (N, m - 1) of all frames; see `learn_likeness`.
     """
     model = policy.model
     if model.device.type == "cpu":
@@ -296,9 +296,7 @@ def learn_critic(
     if numbers is not None:
         features, frame = seen_and_imagined(model, numbered(reader), model.config.margin.clips, generator)
         likeness, places = learn_likeness(model.likeness, likeness, numbers, features, frame, generator)
-        labels, where = reader.labels.failure[frame.cpu().numpy()], places.cpu().numpy()
-        found = likeness.prototypes(where[labels == FAILING], where[labels == SAFE])
-        known = {model.config.margin.failure_specification: found}
+        known = likeness.own_failure
         starts = with_random_sets(starts, places, generator)
     learner = LatentReachability(model.imagination, model.critic, starts, model.config.reachability)
     progress = trange(model.config.reachability.steps, desc="reachability", unit="step", disable=rank() > 0)

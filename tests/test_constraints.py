@@ -40,13 +40,14 @@ KNOWN = {
     "line": [{"x.pos": [-1.0, 0.5]}],
     "many": [{"x.pos": [0.1 * i, 0.25], "y.pos": [0.0, 0.5]} for i in range(SLOTS)],
 }
+KNOWN |= LikenessConfig().own_failure
 CONFIG = LikenessConfig(ALIKE, [-1.0, -1.0], [1.0, 1.0], KNOWN)
 
 
-def margins(names, places):
-    """Margins of places in robot units."""
+def margins(names, places, own=0.9):
+    """Margins of places in robot units, where the filter's own margin is so much."""
     where = torch.tensor(places) / torch.tensor([*ALIKE.values()])
-    return margin_of(where, CONFIG.tensor(names))
+    return margin_of(torch.cat([where, torch.full((len(where), 1), own)], 1), CONFIG.tensor(names))
 
 
 # -- the margin ---
@@ -68,6 +69,12 @@ def margins(names, places):
 )
 def test_margin_is_the_distance_beyond_the_nearest_reach(names, place, beyond):
     assert margins(names, [place]).item() == pytest.approx(np.tanh(beyond), abs=1e-6)
+
+
+@pytest.mark.parametrize("own", [-0.9, -0.1, 0.0, 0.6])
+def test_the_failure_of_the_filter_itself_is_a_constraint(own):
+    assert margins(["failure"], [(0.5, 0.0)], own).item() == pytest.approx(np.tanh(own), abs=1e-6)
+    assert margins(["failure", "zone"], [(0.5, 0.0)], own).item() == pytest.approx(np.tanh(-1), abs=1e-6)
 
 
 def test_margin_of_a_set_is_the_least_of_its_members():
@@ -94,7 +101,7 @@ def test_an_absurd_place_is_not_known():
     ("config", "names", "message"),
     [
         (LikenessConfig(), ["zone"], "takes none.*--alike"),
-        (CONFIG, ["spilled"], "knows zone, line, many. Add spilled.*add-constraint"),
+        (CONFIG, ["spilled"], "knows zone, line, many, failure. Add spilled.*add-constraint"),
         (CONFIG, [], "nothing would count as a failure; this filter knows zone"),
         (CONFIG, ["zone", "many"], f"have {SLOTS + 1} prototypes together.*{SLOTS} at most"),
     ],
@@ -107,7 +114,7 @@ def test_constraints_that_cannot_count_are_refused(config, names, message):
 @pytest.mark.parametrize("names", [["zone"], ["line", "zone"], ["many"], ["zone", "zone"]])
 def test_constraints_that_are_known_count(names):
     CONFIG.require_known(names, trained=True)
-    assert (CONFIG.tensor(names)[:, 2:] > 0).any(1).sum() == sum(len(KNOWN[name]) for name in {*names})
+    assert (CONFIG.tensor(names)[:, 3:] > 0).any(1).sum() == sum(len(KNOWN[name]) for name in {*names})
 
 
 @pytest.mark.parametrize("apart", [0.0, -1.0, float("nan"), float("inf")])
@@ -170,16 +177,18 @@ def test_frames_that_make_no_constraint_are_refused(failing, safe, of, message):
 
 def test_random_sets_are_of_one_to_all_slots():
     sets = random_sets(torch.randn(30, 2), 500, torch.Generator().manual_seed(0))
-    weight = sets[..., 2:]
-    count = (weight > 0).any(-1).sum(1)
-    assert sets.shape == (500, SLOTS, 4) and count.min() == 1 and count.max() == SLOTS
+    weight = sets[..., 3:5]
+    count = (sets[..., 3:] > 0).any(-1).sum(1)
+    assert sets.shape == (500, SLOTS, 6) and count.min() == 1 and count.max() == SLOTS
     reach = 1 / weight[weight > 0]
     assert reach.min() >= REACH[0] - 1e-5 and reach.max() <= REACH[1] + 1e-5
     assert ((weight > 0).sum(-1) == 1).any()
+    own = sets[..., 5] > 0
+    assert 0.2 < own.any(1).float().mean() < 0.45 and (sets[own] == torch.tensor([0, 0, -1, 0, 0, 1.0])).all()
 
 
 def set_network():
-    return SetNetwork(5, 2, 8, torch.nn.Linear(5 + 8 + 1, 3))
+    return SetNetwork(5, 3, 8, torch.nn.Linear(5 + 8 + 1, 3))
 
 
 def test_the_order_of_a_set_does_not_matter_and_empty_slots_say_nothing():
@@ -187,8 +196,8 @@ def test_the_order_of_a_set_does_not_matter_and_empty_slots_say_nothing():
     sets = random_sets(torch.randn(30, 2), 1, torch.Generator().manual_seed(1))
     read = lambda sets: network(torch.cat([here, sets.flatten(1), action], 1))  # noqa: E731
     torch.testing.assert_close(read(sets), read(sets[:, torch.randperm(SLOTS)]))
-    empty = (sets[..., 2:] > 0).any(-1, keepdim=True).logical_not()
-    torch.testing.assert_close(read(sets), read(sets + empty * torch.tensor([5.0, 5.0, 0.0, 0.0])))
+    empty = (sets[..., 3:] > 0).any(-1, keepdim=True).logical_not()
+    torch.testing.assert_close(read(sets), read(sets + empty * torch.tensor([5.0, 5.0, 5.0, 0.0, 0.0, 0.0])))
 
 
 class Places(torch.nn.Module):
@@ -204,7 +213,7 @@ class Places(torch.nn.Module):
 
 def car_of(sets):
     """The true car, whose failures are sets of prototypes, from everywhere in view."""
-    imagination = Constrained(DubinsImagination(), Places(0.25), torch.zeros(SLOTS, 4))
+    imagination = Constrained(DubinsImagination(), Places(0.25), torch.zeros(SLOTS, 6))
     generator = torch.Generator().manual_seed(0)
     scale = torch.tensor([1.1, 1.1, torch.pi])
     draw = lambda n: {"state": (2 * torch.rand(n, 3, generator=generator) - 1) * scale}  # noqa: E731
@@ -217,7 +226,7 @@ def test_a_latent_keeps_its_set_in_imagination():
     after = imagination.step(latent, torch.zeros(6, 1))
     assert torch.equal(after[KEY], latent[KEY])
     features, margin = imagination.judged(after)
-    assert features.shape == (6, 4 + 2 + SLOTS * 4) and torch.equal(margin, imagination.margin(after))
+    assert features.shape == (6, 4 + 3 + SLOTS * 6) and torch.equal(margin, imagination.margin(after))
 
 
 def test_a_critic_learns_sets_that_it_was_never_given():
@@ -226,12 +235,12 @@ def test_a_critic_learns_sets_that_it_was_never_given():
     config = tiny.reachability_config(
         critic_hidden=(64, 64), steps=300, pool=4096, horizon=12, batch_size=256, refresh=100
     )
-    critic = SafetyCritic(4, 1, torch.tensor([[-1.0], [0.0], [1.0]]), config, numbers=2)
+    critic = SafetyCritic(4, 1, torch.tensor([[-1.0], [0.0], [1.0]]), config, numbers=3)
     learner = LatentReachability(imagination, critic, starts, config, torch.Generator().manual_seed(0))
     for _ in range(config.steps):
         learner.update()
-    zone = torch.zeros(SLOTS, 4)
-    zone[0] = torch.tensor([1.0, 1.0, 0.7, 0.7])  # around (0.25, 0.25)
+    zone = torch.zeros(SLOTS, 6)
+    zone[0] = torch.tensor([1.0, 1.0, 0.0, 0.7, 0.7, 0.0])  # around (0.25, 0.25)
     heading_for_it = torch.tensor([[-0.25, 0.25, 0.0], [0.9, 0.25, torch.pi], [0.25, 0.25, 1.0]])
     passing_by = torch.tensor([[-0.9, -0.9, 0.0], [0.9, 0.25, 0.0], [-0.5, 0.25, torch.pi]])
     latent = {"state": torch.cat([heading_for_it, passing_by])}
@@ -295,7 +304,7 @@ def decide(policy):
 
 def test_a_constraint_is_added_saved_and_counts(constrained_filter, root, tmp_path):
     policy = load_filter(constrained_filter)
-    assert policy.config.constraints == ["failure"] and policy.config.likeness.known["failure"]
+    assert policy.config.constraints == ["failure"] and policy.config.likeness.known == LikenessConfig().own_failure
     add_constraint(policy, marked(root, left=[(0, 1), (2, 3), (3, 0)]), "left")
     assert policy.config.constraints == ["failure", "left"] and len(policy.config.likeness.known["left"]) == 3
     save_policy(policy, tmp_path / "with_left")
