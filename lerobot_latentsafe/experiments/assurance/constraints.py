@@ -142,7 +142,6 @@ def mark(monitor: LatentMonitor, case: Case, episodes: list[np.ndarray], picture
 def with_constraints(policy: LatentSafePolicy, known: dict[str, list[Prototype]]) -> None:
     """Let these constraints count, and no others."""
     config = policy.config
-    config.change(constraints=[])
     config.change(likeness=replace(config.likeness, known=known), constraints=[*known])
 
 
