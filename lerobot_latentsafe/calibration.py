@@ -291,14 +291,19 @@ def require_few_alarms(found: Calibration, scores: Scores, share: float) -> None
 # -- what it belongs to ---
 
 
-def belonging(law: LawConfig, weights: str, base_policy: str | None, name: str | None = None) -> dict[str, Any]:
+def belonging(
+    law: LawConfig, weights: str, base_policy: str | None, name: str | None = None, constraints: dict | None = None
+) -> dict[str, Any]:
     """What a calibration is of: the law, the weights and the policy that is shielded.
 
     Args:
         weights, base_policy: digests; see `runtime.checkpoint.weights_digest`. None: no policy was named.
         name: of the base policy, for people.
+        constraints: those that count -> their prototypes, of a filter that takes some.
     """
     decides = {key: getattr(law, key) for key in (*DECIDING, *(OF_NEAREST if law.name == "nearest" else ()))}
+    if constraints:
+        decides["constraints"] = constraints
     return {"law": decides, "weights": weights, "base_policy": base_policy, "base_policy_name": name}
 
 

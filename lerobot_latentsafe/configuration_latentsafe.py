@@ -10,6 +10,7 @@ from lerobot.optim import AdamConfig, CosineDecayWithWarmupSchedulerConfig
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
 from lerobot_latentsafe._compat import training_run
+from lerobot_latentsafe.constraints import LikenessConfig
 from lerobot_latentsafe.critic import BACKUPS, FallbackConfig, ReachabilityConfig
 from lerobot_latentsafe.datasets.layout import check_for_lerobot
 from lerobot_latentsafe.decision import LawConfig
@@ -25,6 +26,7 @@ SEALED_ENTRIES = (
     "output_features",
     *(f"margin.{name}" for name in ("hidden", "layers", "failure_specification")),
     *(f"reachability.{name}" for name in ("critic_hidden", "actor_hidden", "activation", "components")),
+    "likeness",
     "normalization_mapping",
 )
 """All that decides what the weights mean. Of margin and reachability the rest is about training."""
@@ -44,6 +46,8 @@ class LatentSafeConfig(PreTrainedConfig):
         margin: the failure margin (Eq. 3).
         reachability: actor-critic sizes and schedule (Eq. 5).
         fallback: what the fallback policy may do.
+        likeness: what makes frames alike, and the constraints that were made of some; see `constraints.py`.
+        constraints: names of those that count, of a filter that takes constraints, such as [spilled, left_of_line].
         law: when the filter acts; a user may change it.
         trained_on: what the weights were trained on, and how far.
         frame_cache: folder made by `latentsafe cache`; by default the one in the dataset's folder, if there is one.
@@ -61,6 +65,8 @@ class LatentSafeConfig(PreTrainedConfig):
     margin: MarginConfig = field(default_factory=MarginConfig)
     reachability: ReachabilityConfig = field(default_factory=ReachabilityConfig)
     fallback: FallbackConfig = field(default_factory=FallbackConfig)
+    likeness: LikenessConfig = field(default_factory=LikenessConfig)
+    constraints: list[str] = field(default_factory=list)
     law: LawConfig = field(default_factory=LawConfig)
     trained_on: TrainedOn = field(default_factory=TrainedOn)
 
@@ -84,6 +90,7 @@ class LatentSafeConfig(PreTrainedConfig):
             raise ValueError(f"--policy.base_ahead is {self.base_ahead}; expected 0 (on the control thread) or more")
         self.require_critic_of_law()
         self.require_known_commands()
+        self.likeness.require_known(self.constraints, self.trained_on.stage == "critic")
 
     def require_critic_of_law(self) -> None:
         """Refuse a law that reads the critic as something it was not trained for.

@@ -10,6 +10,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
+from lerobot_latentsafe.constraints import SetNetwork
 from lerobot_latentsafe.runtime.checkpoint import OldLayoutError
 
 
@@ -152,6 +153,14 @@ def _mlp(sizes: list[int], activation: str) -> nn.Sequential:
     return nn.Sequential(*layers)
 
 
+def _network(n_components: int, numbers: int, n_action: int, sizes: list[int], activation: str) -> nn.Module:
+    """What reads components, where there are any constraints phi and their set, and an action."""
+    if not numbers:
+        return _mlp([n_components + n_action, *sizes], activation)
+    n_read, width = n_components + numbers, sizes[0] // 2
+    return SetNetwork(n_read, numbers, width, _mlp([n_read + width + n_action, *sizes], activation))
+
+
 class SafetyCritic(nn.Module):
     """Q(z, a) and the fallback policy over projected features, for a discrete or a continuous action space.
 
@@ -161,6 +170,8 @@ class SafetyCritic(nn.Module):
         candidates: (K, A) in [-1, 1], the discrete action set, or None for continuous actions.
         low, high: (A,) in [-1, 1], the range of a continuous policy's commands; by default all of it.
         target: which of `BACKUPS` the values obey.
+        numbers: m, of a critic that takes constraints: features are then followed by phi (m) and the set, which are
+            read as they are (see `Constrained`). 0: it knows one failure.
     """
 
     feature_mean: Tensor
@@ -178,6 +189,7 @@ class SafetyCritic(nn.Module):
         low: Tensor | None = None,
         high: Tensor | None = None,
         target: str = "reachability",
+        numbers: int = 0,
     ):
         super().__init__()
         self.backup = BACKUPS[target]
@@ -188,11 +200,11 @@ class SafetyCritic(nn.Module):
         self.register_buffer("low", -torch.ones(action_dim) if low is None else low, persistent=False)
         self.register_buffer("high", torch.ones(action_dim) if high is None else high, persistent=False)
         self.discrete = candidates is not None
-        n_out = len(candidates) if self.discrete else 1
-        n_in = n_components + (0 if self.discrete else action_dim)
-        self.q = _mlp([n_in, *config.critic_hidden, n_out], config.activation)
+        n_out, n_action = (len(candidates), 0) if self.discrete else (1, action_dim)
+        read = n_components, numbers
+        self.q = _network(*read, n_action, [*config.critic_hidden, n_out], config.activation)
         self.actor = (
-            None if self.discrete else _mlp([n_components, *config.actor_hidden, action_dim], config.activation)
+            None if self.discrete else _network(*read, 0, [*config.actor_hidden, action_dim], config.activation)
         )
 
     def set_projection(self, features: Tensor) -> None:
@@ -201,6 +213,7 @@ class SafetyCritic(nn.Module):
         A world model's latent holds far more numbers than the state has degrees of freedom. A critic of all of them,
         each blown up to unit variance, fits its training states and errs on new ones.
         """
+        features = features[:, : len(self.feature_mean)]
         self.feature_mean.copy_(features.mean(0))
         _, spread, axes = torch.linalg.svd(features - self.feature_mean, full_matrices=False)
         kept = self.projection.shape[1]
@@ -210,8 +223,10 @@ class SafetyCritic(nn.Module):
         self.projection.copy_((axes[:kept] * largest.sign()).T / scale.clamp(min=1e-6))
 
     def project(self, features: Tensor) -> Tensor:
-        """Features (..., D) -> what q and actor read (..., C)."""
-        return (features - self.feature_mean) @ self.projection
+        """Features (..., D) -> what q and actor read (..., C); a set of constraints follows them as it is."""
+        own, more = features.tensor_split([len(self.feature_mean)], -1)
+        projected = (own - self.feature_mean) @ self.projection
+        return torch.cat([projected, more], -1) if more.shape[-1] else projected
 
     def held_actions(self, still: Tensor | None = None) -> Tensor:
         """(K, A) actions worth holding: the candidates, or standing still (1, A) and the extremes of each command."""

@@ -279,7 +279,10 @@ class LatentSafePolicy(PreTrainedPolicy):
     def belonging(self) -> dict[str, Any]:
         """What a calibration of this filter is of: its law, its weights, and the policy that it shields."""
         base = weights_digest(self.base.policy.state_dict()) if self.base else None
-        return belonging(self.config.law, weights_digest(self.model.state_dict()), base, self.config.base_policy_path)
+        config = self.config
+        constraints = {name: config.likeness.known[name] for name in sorted(config.constraints)}
+        weights = weights_digest(self.model.state_dict())
+        return belonging(config.law, weights, base, config.base_policy_path, constraints)
 
     def take_calibration(self, found: Calibration, epsilon: float) -> None:
         """Set the threshold, and keep the evidence beside it, with what it belongs to."""

@@ -14,6 +14,7 @@ from lerobot.utils.constants import OBS_STATE
 from torch import Tensor, nn
 
 from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
+from lerobot_latentsafe.constraints import Constrained, Likeness
 from lerobot_latentsafe.critic import BACKUPS, SafetyCritic, safety_bellman_target
 from lerobot_latentsafe.datasets.clips import Clip
 from lerobot_latentsafe.latent import Latent, is_sound, map_latent
@@ -85,6 +86,7 @@ class SafetyModel(nn.Module):
         units: normalises and denormalises.
         limits: of what the robot can show and may be told.
         world_model, margin, critic: the parts.
+        likeness: says where a latent is, of a filter that takes constraints; else None.
         familiar: what the monitor of the unknown has learned; None where there is none.
         lacks_weights: whether the configuration speaks of trained weights, and nothing was loaded or trained since.
 
@@ -111,6 +113,7 @@ class SafetyModel(nn.Module):
         self._perhaps_targets = trained_on.perhaps_targets(config.fallback.frozen_commands)
         self.familiar: Familiar | None = None
         self.margin = self.new_margin()
+        self.likeness = self.new_likeness()
         self.critic = self.new_critic()
         self.lacks_weights = trained_on.has_reached("world_model")
         self.register_load_state_dict_post_hook(_has_loaded)
@@ -134,6 +137,11 @@ class SafetyModel(nn.Module):
         config = self.config.margin
         return FailureMargin(self.world_model.feature_dim, config.hidden, config.layers).to(self.device)
 
+    def new_likeness(self) -> Likeness | None:
+        """What says where a latent is, with fresh weights; None where the filter takes no constraints."""
+        config = self.config.likeness
+        return Likeness(self.world_model.feature_dim, config).to(self.device) if config.alike else None
+
     def new_critic(self) -> SafetyCritic:
         """A critic with fresh weights, bounded to the commands that the fallback may move."""
         units, fallback, candidates = self.units, self.config.fallback, None
@@ -142,7 +150,8 @@ class SafetyModel(nn.Module):
             candidates = units.normalise_motions(robots)
         bounds = fallback.bounds(units.action_names, units.action_varies & ~units.frozen)
         sizes = self.world_model.feature_dim, len(units.action_low), candidates, self.config.reachability
-        return SafetyCritic(*sizes, *bounds, self.config.trained_on.target).to(self.device)
+        numbers = len(self.config.likeness.numbers)
+        return SafetyCritic(*sizes, *bounds, self.config.trained_on.target, numbers).to(self.device)
 
     @property
     def device(self) -> torch.device:
@@ -154,9 +163,13 @@ class SafetyModel(nn.Module):
         return torch.autocast(self.device.type, enabled=False)
 
     @property
-    def imagination(self) -> LatentImagination:
-        """World model and margin, as reachability sees them."""
-        return LatentImagination(self.world_model, self.margin, self.units.frozen, self.config.law.samples > 0)
+    def imagination(self) -> LatentImagination | Constrained:
+        """World model and margin, as reachability sees them; the margin is that of the constraints, if there are."""
+        inside = LatentImagination(self.world_model, self.margin, self.units.frozen, self.config.law.samples > 0)
+        if self.likeness is None:
+            return inside
+        active = self.config.likeness.tensor(self.config.constraints)
+        return Constrained(inside, self.likeness, active.to(self.device))
 
     # -- seeing ---
 

@@ -547,7 +547,7 @@ class Shield:
     def _accepts(self, other: "Shield") -> bool:
         """Whether the other has our weights, and lets nothing pass that we would not."""
         own, theirs = self.model.config, other.model.config
-        if any(getattr(own, group) != getattr(theirs, group) for group in SEALED):
+        if any(getattr(own, group) != getattr(theirs, group) for group in (*SEALED, "likeness", "constraints")):
             return False
         if not theirs.law.passes_nothing_more_than(own.law):
             return False

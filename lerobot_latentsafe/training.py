@@ -14,6 +14,13 @@ import torch
 from torch import Tensor, nn
 from tqdm import trange
 
+from lerobot_latentsafe.constraint_training import (
+    learn_likeness,
+    numbered,
+    numbers_named,
+    with_random_sets,
+)
+from lerobot_latentsafe.constraints import ConstraintError, LikenessConfig
 from lerobot_latentsafe.critic import BACKUPS
 from lerobot_latentsafe.datasets.adoption import adopt_dataset
 from lerobot_latentsafe.datasets.clips import ClipReader, FilterData
@@ -222,12 +229,14 @@ def covered_actions(model: SafetyModel, reader: ClipReader, coverage: float) -> 
 
 def train_reachability(
     path: str | Path, dataset_meta, output_dir: Path, seed: int = 0, steps: int | None = None,
-    target: str = "reachability",
+    target: str = "reachability", alike: dict[str, float] | None = None,
 ) -> LatentSafePolicy:  # fmt: skip
     """Load a stage-1 checkpoint, learn its safety critic, save the filter.
 
     Args:
         target: what the critic learns: the safety value of Eq. 5, or the `risk` of SQRL.
+        alike: number of the recording -> how far apart alike frames may be in it: the critic then takes constraints
+            (see `constraints.py`). The failure of the margin becomes the first of them.
 
     Several ranks share the work (see `LatentReachability`); the first one saves.
 
@@ -240,47 +249,70 @@ def train_reachability(
         FolderInUseError: another process trains there.
         FloatingPointError: the training diverged; nothing is saved.
         ValueError: there is no such target, or nothing to be trained.
+        ConstraintError: frames cannot be told apart by these numbers.
     """
     if target not in BACKUPS:
         raise ValueError(f"--target is {target!r}; expected one of {', '.join(BACKUPS)}")
     require_at_least("--steps", steps, 1)
     require_at_least("--seeds", seed, 0)
+    if alike and target == "risk":
+        raise ConstraintError("--alike and --target=risk: a risk is that of one failure; give one of them")
     policy, reader = load_with_cache(path, dataset_meta, seed)
-    run = _run(policy, reader, "reachability", seed=seed, steps=steps, target=target)
+    options = {"alike": alike} if alike else {}
+    run = _run(policy, reader, "reachability", seed=seed, steps=steps, target=target, **options)
     before = _trained_before(Path(output_dir), run)
     if before is not None:
         return before
     with replacing_folder(output_dir) if rank() == 0 else nullcontext() as folder:
         started = time.process_time()
-        _learn_critic(policy, reader, seed, steps, target)
+        numbers = numbers_named(dataset_meta, [*alike]) if alike else None
+        likeness = LikenessConfig(alike or {}, own=policy.config.margin.failure_specification)
+        learn_critic(policy, reader, seed, steps, target, likeness, numbers)
         if rank() == 0:
             _save(policy, policy.model.critic, folder, run)
             print(f"reachability: {time.process_time() - started:.0f} CPU-s")
     return policy
 
 
-def _learn_critic(policy: LatentSafePolicy, reader: ClipReader, seed: int, steps: int | None, target: str) -> None:
-    """Give a filter a trained critic."""
+def learn_critic(
+    policy: LatentSafePolicy, reader: ClipReader, seed: int, steps: int | None, target: str = "reachability",
+    likeness: LikenessConfig | None = None, numbers: np.ndarray | None = None,
+) -> None:  # fmt: skip
+    """Give a filter a trained critic.
+
+    Args:
+        likeness, numbers: of a critic that takes constraints, and (N, m - 1) of all frames; see `learn_likeness`.
+    """
     model = policy.model
     if model.device.type == "cpu":
         keep_freed_memory()
     generator = torch.Generator(device="cpu").manual_seed(seed)
-    _aim_at(model, reader, target, steps)
+    likeness = likeness or LikenessConfig()
+    _aim_at(model, reader, target, steps, likeness)
     require_at_least("--policy.reachability.steps", model.config.reachability.steps, 1)
     model.world_model.requires_grad_(False)
     model.margin.requires_grad_(False)
-    starts = encoded_starts(model, reader, generator)
+    starts, known = encoded_starts(model, reader, generator), {}
+    if numbers is not None:
+        features, frame = seen_and_imagined(model, numbered(reader), model.config.margin.clips, generator)
+        likeness, places = learn_likeness(model.likeness, likeness, numbers, features, frame, generator)
+        known = likeness.own_failure
+        starts = with_random_sets(starts, places, generator)
     learner = LatentReachability(model.imagination, model.critic, starts, model.config.reachability)
     progress = trange(model.config.reachability.steps, desc="reachability", unit="step", disable=rank() > 0)
     for step in progress:
         metrics = learner.update()
         if step % 200 == 0:
             progress.set_postfix(loss=f"{metrics['critic_loss']:.1e}", gamma=f"{metrics['gamma']:.4f}")
-    policy.config.change(trained_on=replace(trained_on_too(policy, reader), stage="critic"))
+    policy.config.change(
+        trained_on=replace(trained_on_too(policy, reader), stage="critic"),
+        likeness=replace(likeness, known=known),
+        constraints=[*known],
+    )
     model.critic.eval()
 
 
-def _aim_at(model: SafetyModel, reader: ClipReader, target: str, steps: int | None) -> None:
+def _aim_at(model: SafetyModel, reader: ClipReader, target: str, steps: int | None, likeness: LikenessConfig) -> None:
     """Give a model a fresh critic for this target, and a configuration that says so."""
     config = model.config
     law = replace(config.law, name=target, lookahead=0 if target == "risk" else config.law.lookahead)
@@ -291,7 +323,11 @@ def _aim_at(model: SafetyModel, reader: ClipReader, target: str, steps: int | No
         low, high = covered_actions(model, reader, reachability.coverage)
         fallback = replace(fallback, low=low, high=high)
     trained_on = replace(config.trained_on, stage="world_model", target=target)
-    config.change(trained_on=trained_on, law=law, reachability=reachability, fallback=fallback, frame_cache=None)
+    config.change(
+        trained_on=trained_on, law=law, reachability=reachability, fallback=fallback, frame_cache=None,
+        likeness=likeness, constraints=[],
+    )  # fmt: skip
+    model.likeness = model.new_likeness()
     model.critic = model.new_critic()
 
 

@@ -126,7 +126,9 @@ def test_equal_seeds_record_equal_episodes():
 
 
 def test_names_of_sources():
-    assert list(SOURCES) == ["random", "random_continuous", "random_left_only", "careful", "reckless"]
+    assert list(SOURCES) == [
+        "random", "random_located", "random_continuous", "random_left_only", "careful", "reckless",
+    ]  # fmt: skip
 
 
 def test_demonstrations_also_store_the_position(tmp_path):

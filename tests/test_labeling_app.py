@@ -85,6 +85,12 @@ def test_label_undo_and_changes(client, server):
     assert say(client, "api/undo/spilled", tab="t").json()["entry"] is None
 
 
+def test_a_frame_is_marked_alone(client, server):
+    entry = say(client, "api/marks/spilled", episode=1, frame=0, seen=0, tab="t").json()["entry"]
+    assert entry["mixed"] == [1] + [-1] * (int(server.store.length[1]) - 1) and entry["first"] is None
+    assert say(client, "api/marks/spilled", episode=1, frame=10**6, seen=entry["at"], tab="t").status_code == 400
+
+
 def test_two_tabs_cannot_overwrite_each_other_unseen(client):
     assert label(client, 3, 2).status_code == 200
     answer = label(client, 3, 4)

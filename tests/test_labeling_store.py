@@ -357,3 +357,18 @@ def test_missing_episode_file_is_a_message(root):
 )
 def test_first_failing(labels, first):
     assert first_failing(np.array(labels)) == first
+
+
+def test_a_frame_is_marked_alone_and_the_mark_taken_back(store):
+    length = int(store.length[3])
+    said = store.mark("spilled", 3, 2, "ann", seen=0)
+    assert said.mixed and said.by == "ann"
+    assert store.labels("spilled", 3).tolist() == [-1, -1, 1] + [-1] * (length - 3)
+    store.mark("spilled", 3, 4, "ann", seen=said.at)
+    with pytest.raises(ConflictError):
+        store.mark("spilled", 3, 5, "bo", seen=said.at)
+    store.undo("spilled")
+    assert store.labels("spilled", 3).tolist() == [-1, -1, 1] + [-1] * (length - 3)
+    assert store.mark("spilled", 3, 2, "ann").by is None and (store.labels("spilled", 3) == -1).all()
+    with pytest.raises(ValueError, match=f"expected 0 to {length - 1}"):
+        store.mark("spilled", 3, length, "ann")

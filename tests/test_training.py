@@ -103,7 +103,7 @@ def test_a_critic_that_diverged_is_not_saved(tiny_world_model, cache_meta, tmp_p
         with torch.no_grad():
             next(policy.model.critic.parameters()).fill_(float("nan"))
 
-    monkeypatch.setattr(training, "_learn_critic", diverges)
+    monkeypatch.setattr(training, "learn_critic", diverges)
     with pytest.raises(
         FloatingPointError, match=r"SafetyCritic holds numbers that are not finite, so nothing is saved"
     ):
@@ -156,8 +156,8 @@ def test_a_seed_of_several_has_its_own_folder_and_each_is_done_once(
 
     options = (PolicySource(str(tiny_world_model)), tmp_path / "out", DatasetSource(tiny.REPO_ID, str(cache_root)))
     with monkeypatch.context() as patch, pytest.raises(Killed):
-        learn, calls = training._learn_critic, iter([False, True])
-        patch.setattr(training, "_learn_critic", lambda *given: killed() if next(calls) else learn(*given))
+        learn, calls = training.learn_critic, iter([False, True])
+        patch.setattr(training, "learn_critic", lambda *given: killed() if next(calls) else learn(*given))
         TrainReachability(*options, seeds=[0, 1], steps=3).run()
     first = (tmp_path / "out" / "seed_0" / "model.safetensors").stat().st_mtime_ns
     TrainReachability(*options, seeds=[0, 1], steps=3).run()

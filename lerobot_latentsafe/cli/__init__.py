@@ -76,6 +76,9 @@ VERBS: dict[str, Verb] = {
     "train-reachability": Verb(
         "train", _TRAIN, "TrainReachability", "learn the safety value and the fallback in a world model's imagination"
     ),
+    "add-constraint": Verb(
+        "train", _TRAIN, "AddConstraint", "let a filter heed one more failure, of a few marked frames, without training"
+    ),
     "train-dreamer": Verb("train", _DREAMER, "TrainDreamer", "learn the blocks' task policy in imagination"),
     "calibrate": Verb("train", _TRAIN, "Calibrate", "choose epsilon on held-out episodes and store the evidence"),
     "wrap": Verb("deploy", _DEPLOY, "Wrap", "write a filter and the policy it shields as one self-contained folder"),

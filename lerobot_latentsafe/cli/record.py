@@ -31,6 +31,7 @@ class Collect:
     - random: the paper's 2,000 trajectories of three actions
     - random_continuous: the same with actions from the whole range
     - random_left_only: without the turn to the right (the ablation)
+    - random_located: the first, with the position in observation.environment_state, for train-reachability --alike
     - careful, reckless: drives to the goal, around the obstacle or through it, for diffusion policies
 
     Sources of the Franka:

@@ -19,6 +19,7 @@ from lerobot_latentsafe.calibration import (
 from lerobot_latentsafe.cli.options import CACHE_THEM, DatasetSource
 from lerobot_latentsafe.cli.places import PolicySource
 from lerobot_latentsafe.conformal import fixed_sequence, needed_for_sure, proven
+from lerobot_latentsafe.constraints import LikenessConfig
 from lerobot_latentsafe.datasets.build_cache import TOKEN_COMPONENTS, TOKEN_TYPES, Pictures, Tokens, build_frame_cache
 from lerobot_latentsafe.datasets.clips import ClipReader
 from lerobot_latentsafe.datasets.episode_groups import groups_of, weights_of
@@ -28,10 +29,11 @@ from lerobot_latentsafe.encoders.perception import PerceptionConfig
 from lerobot_latentsafe.evaluation.decision_values import decision_values
 from lerobot_latentsafe.evaluation.rollouts import failures_by_epsilon
 from lerobot_latentsafe.evaluation.statistics import provenance, write_json
-from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
+from lerobot_latentsafe.labeling.constraints import add_constraint
+from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
 from lerobot_latentsafe.reports.figures import misses_and_alarms, save
 from lerobot_latentsafe.runtime import distributed
-from lerobot_latentsafe.runtime.files import replacing_folder
+from lerobot_latentsafe.runtime.files import refuse_existing, replacing_folder
 from lerobot_latentsafe.runtime.hub import save_policy
 from lerobot_latentsafe.runtime.options import require_at_least
 from lerobot_latentsafe.training import load_with_cache, train_margin, train_reachability
@@ -141,9 +143,13 @@ class TrainReachability:
     """Gradient steps; by default the configuration's."""
     target: str = "reachability"
     """What the critic learns: the safety value (reachability), or SQRL's risk of failing, a baseline."""
+    alike: dict[str, float] = field(default_factory=dict)
+    """Number of the recording -> how far apart alike frames may be in it, such as {x.pos: 0.1, y.pos: 0.1}: the critic
+    then takes constraints that are added later, without training; see latentsafe add-constraint."""
 
     def __post_init__(self) -> None:
         require_at_least("--steps", self.steps, 1)
+        LikenessConfig(self.alike)
         if not self.seeds or len({*self.seeds}) < len(self.seeds) or min(self.seeds) < 0:
             raise ValueError(f"--seeds is {self.seeds}; expected numbers from 0 on, each once, such as [0,1,2]")
 
@@ -154,9 +160,43 @@ class TrainReachability:
             for seed in self.seeds:
                 output_dir = self.output_dir if len(self.seeds) == 1 else self.output_dir / f"seed_{seed}"
                 meta = self.dataset.metadata()
-                train_reachability(self.policy.path, meta, output_dir, seed, self.steps, self.target)
+                train_reachability(self.policy.path, meta, output_dir, seed, self.steps, self.target, self.alike)
                 if distributed.rank() == 0:
                     print(f"filter with a trained critic in {output_dir}")
+
+
+@dataclass
+class AddConstraint:
+    """Let a filter heed one more failure, which a few marked frames show: it needs no training.
+
+    latentsafe add-constraint --policy.path=outputs/filter --dataset.root=data/bag --specification=left_of_line \\
+      --output_dir=outputs/filter_with_line
+
+    Mark one to five frames that fail on the page of latentsafe label (key M), under a specification of that name. Or
+    label a few episodes there as usual: they also tell how far the failure reaches. The filter must take constraints
+    (train-reachability --alike=...). What it heeded before, it heeds still; --policy.constraints=[left_of_line,...]
+    says which count wherever it is used.
+    """
+
+    policy: PolicySource
+    output_dir: Path
+    """The folder to write."""
+    specification: str
+    """The name of the labels, and of the constraint."""
+    dataset: DatasetSource = field(default_factory=DatasetSource)
+    of: list[str] | None = None
+    """The numbers that count, such as [x.pos] for a line; by default all that say what is alike."""
+
+    def run(self) -> None:
+        """Make it of the marked frames, save the filter with it, and say where it is."""
+        refuse_existing(self.output_dir)
+        policy = load_filter(self.policy.path)
+        found = add_constraint(policy, self.dataset.frames(), self.specification, self.of)
+        save_policy(policy, self.output_dir)
+        for prototype in found:
+            places = (f"{name} {where:g} \u00b1 {reach:g}" for name, (where, reach) in prototype.items())
+            print(f"{self.specification}: {', '.join(places)}")
+        print(f"wrote {self.output_dir}: --policy.constraints=[{','.join(policy.config.constraints)}]")
 
 
 @dataclass

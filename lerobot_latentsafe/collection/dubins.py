@@ -129,20 +129,22 @@ def _drive(
 
 SOURCES: dict[str, Callable[[int, np.random.Generator], Iterator[Episode]]] = {
     "random": lambda n, rng: random_episodes(n, rng, car.TURN_RATES),
+    "random_located": lambda n, rng: random_episodes(n, rng, car.TURN_RATES),
     "random_continuous": lambda n, rng: random_episodes(n, rng),
     "random_left_only": lambda n, rng: random_episodes(n, rng, car.TURN_RATES[1:]),
     "careful": lambda n, rng: goal_episodes(n, rng, careful_driver),
     "reckless": lambda n, rng: goal_episodes(n, rng, reckless_driver),
 }
 """What `latentsafe collect --source=...` can record."""
-WITH_POSITION = ("careful", "reckless")
+WITH_POSITION = ("careful", "reckless", "random_located")
 
 
 def collect_dubins(source: str, repo_id: str, root: str | Path, n_episodes: int | None, seed: int) -> LeRobotDataset:
     """Record episodes of the car, or go on recording them; None records the paper's 2,000.
 
     Demonstrations also store the car's position as observation.environment_state, which lets a diffusion policy
-    of a few hundred kB do the task; the safety filter reads images and heading only.
+    of a few hundred kB do the task; the safety filter reads images and heading only. `random_located` stores it, too:
+    a filter that takes new constraints learns from it which frames are alike.
 
     Raises:
         ValueError: unknown source, no episodes, or an unfinished recording of another source or seed.

@@ -270,7 +270,9 @@ class FailureLabels:
     episode: np.ndarray
 
     @classmethod
-    def load(cls, root: str | Path, specification: str = "failure", repo_id: str | None = None) -> "FailureLabels":
+    def load(
+        cls, root: str | Path, specification: str = "failure", repo_id: str | None = None, both: bool = True
+    ) -> "FailureLabels":
         """Read labels of a dataset on disk.
 
         They come from the column `specification`, or from the sidecar `labels/<specification>.parquet` with the
@@ -279,6 +281,7 @@ class FailureLabels:
 
         Args:
             repo_id: the dataset's id, where it is known.
+            both: refuse labels that lack failing or safe frames, of which no margin can be fitted.
 
         Raises:
             UnlabelledDatasetError: neither exists, a sidecar does not match the frames, or one class is missing.
@@ -297,7 +300,8 @@ class FailureLabels:
         else:
             raise UnlabelledDatasetError(_no_labels(content, specification, repo_id))
         labels = cls(failure, terminal, episode)
-        labels._check(root, specification)
+        if both:
+            labels._check(root, specification)
         return labels
 
     def _check(self, root: Path, specification: str) -> None:

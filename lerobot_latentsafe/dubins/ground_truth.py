@@ -9,7 +9,7 @@ Two truths, because they differ and the paper's table uses the second:
 V(s) is the largest, over action sequences, of the smallest margin l along the way; V <= 0 is unsafe.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -60,11 +60,15 @@ def grid_states(grid: tuple = PAPER_GRID) -> np.ndarray:
 
 
 def solve_grid(
-    n: int = 101, n_headings: int = 60, half_width: float = 1.5, turn_rates: Sequence[float] | None = None
-) -> tuple[np.ndarray, int]:
+    n: int = 101, n_headings: int = 60, half_width: float = 1.5, turn_rates: Sequence[float] | None = None,
+    margin: Callable[[np.ndarray], np.ndarray] = car.margin,
+) -> tuple[np.ndarray, int]:  # fmt: skip
     """Undiscounted grid value iteration V = min(l, max_u V(f(s, u))), trilinear, periodic heading.
 
     Leaving the grid counts as safe for ever, which is immaterial this far from the disc.
+
+    Args:
+        margin: l of states (N, 3) -> (N,), of another failure than the disc.
 
     Returns:
         V (n, n, n_headings) on [-half_width, half_width]^2 x [0, 2 pi) and the number of sweeps.
@@ -72,7 +76,7 @@ def solve_grid(
     turn_rates = car.TURN_RATES if turn_rates is None else np.asarray(turn_rates)
     grid = ((-half_width, half_width, n), (-half_width, half_width, n), (0.0, 2 * np.pi, n_headings))
     states = grid_states(grid)
-    l = car.margin(states)
+    l = margin(states)
     successors = [car.step(states, u) for u in turn_rates]
     scale = np.array([(n - 1) / (2 * half_width)] * 2 + [n_headings / (2 * np.pi)])
     offset = np.array([half_width, half_width, 0.0])

@@ -112,6 +112,7 @@ class LabelServer:
             Route("/api/dataset", self.dataset),
             Route("/api/labels/{specification}", self.labels),
             Route("/api/labels/{specification}", self.label, methods=["POST"]),
+            Route("/api/marks/{specification}", self.mark, methods=["POST"]),
             Route("/api/undo/{specification}", self.undo, methods=["POST"]),
             Route("/api/frames/{camera:int}/{episode:int}", self.episode_frames),
             Route("/api/margin/{episode:int}", self.margin),
@@ -162,6 +163,15 @@ class LabelServer:
             first = _number(first, "first", int(self.store.length[episode]))
         seen, tab = _number(asked.get("seen"), "seen", 2**53), _text(asked.get("tab"))
         await run_in_threadpool(self.store.label, specification, episode, first, self.user, seen, tab)
+        return self._changed(specification, episode)
+
+    async def mark(self, request: Request) -> Response:
+        """Mark one frame alone as failing, or take that back; it is on disk when the answer comes."""
+        specification, asked = self._specification(request), await _body(request)
+        episode = _number(asked.get("episode"), "episode", len(self.store) - 1)
+        frame = _number(asked.get("frame"), "frame", int(self.store.length[episode]) - 1)
+        seen, tab = _number(asked.get("seen"), "seen", 2**53), _text(asked.get("tab"))
+        await run_in_threadpool(self.store.mark, specification, episode, frame, self.user, seen, tab)
         return self._changed(specification, episode)
 
     async def undo(self, request: Request) -> Response:

@@ -159,16 +159,40 @@ class LabelStore:
         with self._lock:
             self._catch_up(specification)
             now = self.verdict(specification, episode)
-            if seen is not None and seen != now.at:
-                if now.first == first and not now.mixed:
-                    return now  # saved before, and only the answer was lost
-                raise ConflictError(f"episode {episode} was changed by {now.by or 'somebody'} meanwhile")
-            before = self._state(specification, episode)
-            after = self._write(specification, episode, (failure, by if first is not None else None, None))
-            stack = self._undo[specification, tab]
-            stack.append((episode, before, after.at))
-            del stack[:-UNDO_DEPTH]
-            return after
+            if seen is not None and seen != now.at and now.first == first and not now.mixed:
+                return now  # saved before, and only the answer was lost
+            return self._change(specification, episode, failure, by if first is not None else None, seen, tab)
+
+    def _change(
+        self, specification: str, episode: int, failure: np.ndarray, by: str | None, seen: int | None, tab: str
+    ) -> Verdict:
+        """Set an episode's labels (T,) unless somebody else did meanwhile, save, and remember how to undo it."""
+        now = self.verdict(specification, episode)
+        if seen is not None and seen != now.at:
+            raise ConflictError(f"episode {episode} was changed by {now.by or 'somebody'} meanwhile")
+        before = self._state(specification, episode)
+        after = self._write(specification, episode, (failure, by, None))
+        stack = self._undo[specification, tab]
+        stack.append((episode, before, after.at))
+        del stack[:-UNDO_DEPTH]
+        return after
+
+    def mark(
+        self, specification: str, episode: int, frame: int, by: str, seen: int | None = None, tab: str = ""
+    ) -> Verdict:
+        """Mark one frame alone as failing, or take the mark back, and save; all other frames stay as they are.
+
+        A few marked frames are enough for a constraint (`latentsafe add-constraint`). Arguments, errors: see `label`.
+        """
+        length = int(self.length[episode])
+        if not 0 <= frame < length:
+            raise ValueError(f"frame is {frame}; expected 0 to {length - 1}")
+        with self._lock:
+            self._catch_up(specification)
+            failure = self.labels(specification, episode)
+            failure[frame] = UNLABELLED if failure[frame] == FAILING else FAILING
+            any_left = bool((failure != UNLABELLED).any())
+            return self._change(specification, episode, failure, by if any_left else None, seen, tab)
 
     def label_frames(self, specification: str, failure: dict[int, np.ndarray], by: str) -> None:
         """Save whole label vectors of many episodes at once, as automatic labellers make them."""

@@ -287,6 +287,18 @@ function mark(first) {
   if (first !== null && next < 0) toast("Every episode is labelled.");
 }
 
+async function markFrame() { // this frame alone: what a constraint is made of
+  const [episode, at] = ($("view").dataset.shown ?? "").split(":").map(Number);
+  if (episode !== current || at !== frame) return toast("Wait for the picture.");
+  await flush();
+  const body = { episode, frame: at, seen: entries[episode].at, tab };
+  const { entry } = await (await call(`marks/${specification}`, body)).json();
+  entries[episode] = entry;
+  showRow(episode); showProgress(); showVerdict();
+  const n = entry.mixed?.filter(label => label === 1).length ?? 0;
+  toast(`${n} frame${n === 1 ? "" : "s"} of this episode marked.`);
+}
+
 // -- showing ---
 
 const rows = new Map();
@@ -485,6 +497,7 @@ const LABELS = {
   f: () => { stop(); mark(frame); },
   s: () => mark(length(current)),
   c: () => mark(null),
+  m: () => { stop(); markFrame().catch(error => { toast(error.message); lost(error); }); },
   Enter: () => { const { guess, first } = entries[current]; if (guess !== undefined && first === null) mark(guess); },
   z: () => undo().catch(error => { toast(error.message); lost(error); }),
 };
