@@ -454,7 +454,7 @@ class DinoWM(TerminationHead):
 
     # -- learning ---
 
-    def loss(self, clip: Clip) -> tuple[Tensor, Tensor, dict[str, float]]:
+    def loss(self, clip: Clip) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
         """Errors one step ahead of frames that were seen (teacher forcing), and of the rest imagined open loop.
 
         The features are those of latents seen and, from where imagination took over, of latents imagined. Episodes
@@ -479,7 +479,7 @@ class DinoWM(TerminationHead):
         """Without a memory, what follows a frame is not known without its patches."""
         return self.config.token_share if self.memory_dim else 1.0
 
-    def _part_loss(self, clip: Clip, names: list[str], last: int) -> tuple[Tensor, Tensor, dict[str, float]]:
+    def _part_loss(self, clip: Clip, names: list[str], last: int) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
         """Loss, features and metrics of clips of which `names` are predicted, and which are seen up to frame `last`."""
         percepts = {name: values for name, values in clip.percepts.items() if name != "tokens" or name in names}
         frames = {**self._looked_at(percepts), "state": clip.state}
@@ -490,14 +490,14 @@ class DinoWM(TerminationHead):
         unit = self._unit_of_change(frames, goes_on)
         begun = {name: value[:, : last + 2] for name, value in frames.items()}
         losses = self._errors(ahead.frames, begun, goes_on[:, known], slice(0, -1), unit)
-        metrics = {f"loss_{name}": value.item() for name, value in losses.items()}
+        metrics = {f"loss_{name}": value.detach() for name, value in losses.items()}
         loss = (last + 1) / (length - 1) * torch.stack(list(losses.values())).sum()
         context = F.pad(ahead.frames["context"], (0, 0, 1, 0)) * (seen[:, : last + 2] > 1)[..., None]
         if self.config.open_loop > 0:
             imagined = self._imagine(ahead, clip, seen, last)
             alive = goes_on[:, last:].cumprod(1).bool()
             losses = self._errors(imagined, frames, alive, slice(last, last + 1), unit)
-            metrics |= {f"loss_{name}_open_loop": value.item() for name, value in losses.items()}
+            metrics |= {f"loss_{name}_open_loop": value.detach() for name, value in losses.items()}
             loss = loss + self.config.open_loop * torch.stack(list(losses.values())).sum()
             for name, truth in frames.items():
                 ahead_of_last = torch.where(_like(alive, truth), imagined[name], truth[:, last + 1 :])

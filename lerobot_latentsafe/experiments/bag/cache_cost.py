@@ -15,7 +15,7 @@ from lerobot.datasets.dataset_tools import merge_datasets
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.scripts import lerobot_train
 
-from lerobot_latentsafe.datasets.build_cache import eight_bits
+from lerobot_latentsafe.datasets.cache_recipes import eight_bits
 from lerobot_latentsafe.datasets.frame_cache import FOLDER, MANIFEST, FrameCache, dataset_fingerprint, scale_file
 from lerobot_latentsafe.evaluation.statistics import provenance
 from lerobot_latentsafe.experiments.timing import cpu_seconds, ratio, spread
