@@ -5,6 +5,7 @@ import os
 import shutil
 import signal
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -14,6 +15,7 @@ import tiny
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from lerobot_latentsafe.cli.command_line import parsed
 from lerobot_latentsafe.datasets import cache_tasks
 from lerobot_latentsafe.datasets.build_cache import build_frame_cache
 from lerobot_latentsafe.datasets.cache_recipes import Pictures
@@ -149,7 +151,7 @@ FAULTS = {
 }
 
 
-@pytest.mark.fault("D31", "a shard of a cache is missing, torn, of another encoder or twice in the index", "A message")
+@pytest.mark.fault("D08", "a shard of a cache is missing, torn, of another encoder or twice in the index", "A message")
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_shard_that_is_wrong_is_refused(broken, fault):
     change, said = FAULTS[fault]
@@ -246,7 +248,7 @@ class Deadly(Pictures):
         return super().perceive(images)
 
 
-@pytest.mark.fault("K31", "a worker is killed while it makes a shard", "Its shard is made by the same command again")
+@pytest.mark.fault("K52", "a worker is killed while it makes a shard", "Its shard is made by the same command again")
 def test_four_tasks_of_two_workers_one_killed_equal_one_process(dataset_root, whole_root, tmp_path):
     pytest.importorskip("datatrove")
     mark = tmp_path / "mark"
@@ -255,9 +257,32 @@ def test_four_tasks_of_two_workers_one_killed_equal_one_process(dataset_root, wh
     with pytest.raises(TasksFailedError, match="a worker was killed"):
         build_sharded_cache(build, Tasks(N, workers=2))
     assert not mark.exists() and not all(build.is_made(number) for number in range(N))
-    build_sharded_cache(build, Tasks(N, workers=2))
+    build_sharded_cache(build, Tasks(N))
     for name, expected in percepts(whole_root).items():
         np.testing.assert_array_equal(percepts(tmp_path / "cache")[name], expected)
+
+
+def test_the_command_makes_shards(dataset_root, whole_root, tmp_path, capsys):
+    pytest.importorskip("datatrove")
+    given = [f"--dataset.repo_id={tiny.REPO_ID}", f"--dataset.root={dataset_root}", f"--image_size={SIZE}"]
+    cache = parsed("cache", [*given, f"--output_dir={tmp_path / 'cache'}", "--tasks.number=2"])
+    cache.run()
+    assert "train with --dataset.repo_id=me/car_cache" in capsys.readouterr().out
+    for name, expected in percepts(whole_root).items():
+        np.testing.assert_array_equal(percepts(tmp_path / "cache")[name], expected)
+
+
+def test_the_file_for_a_cluster_on_the_page_is_read(tmp_path):
+    page = (Path(__file__).parents[1] / "docs" / "scaling.md").read_text()
+    file = tmp_path / "cluster.yaml"
+    file.write_text(page.split("```yaml")[1].split("```")[0])
+    tasks = parsed("cache", [f"--config_path={file}"]).tasks
+    assert (tasks.number, tasks.workers, tasks.executor) == (1000, 100, "slurm")
+    assert tasks.options == {"partition": "cpu", "time": "4:00:00", "cpus_per_task": 4, "mem_per_cpu_gb": 4}
+    tasks = parsed(
+        "cache", ["--output_dir=x", "--tasks.number=2", "--tasks.executor=ray", "--tasks.options={time: 9}"]
+    ).tasks
+    assert tasks.options == {"time": 9}
 
 
 # -- several datasets ---

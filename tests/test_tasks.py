@@ -29,7 +29,7 @@ def test_every_task_is_done_once_and_then_the_last_one(files, workers):
     assert not files.job().logs.exists()
 
 
-@pytest.mark.fault("D30", "the disk is full in one task of several", "The others are done and stay; a message names it")
+@pytest.mark.fault("D07", "the disk is full in one task of several", "The others are done and stay; a message names it")
 def test_a_task_that_fails_leaves_the_others(files):
     (files.folder / "1.full").touch()
     with pytest.raises(
@@ -45,7 +45,7 @@ def test_a_task_that_fails_leaves_the_others(files):
 
 
 @pytest.mark.fault(
-    "K30", "a worker is killed in its task", "A message; what was done stays, and the same command goes on"
+    "K51", "a worker is killed in its task", "A message; what was done stays, and the same command goes on"
 )
 def test_a_killed_worker_is_an_error_and_not_waited_for(files):
     (files.folder / "3.killed").touch()

@@ -119,6 +119,8 @@ def _link(shard: Path, files: Sequence[Path]) -> None:
 
 def _join_labels(roots: Sequence[Path], folder: Path, repo_id: str) -> None:
     specifications = [*dict.fromkeys(name for root in roots for name in specifications_of(root))]
+    if not specifications:
+        return
     contents, joined = [Content(root, specifications) for root in roots], Content(folder)
     for name in specifications:
         parts = [_labels_of(root, name, content) for root, content in zip(roots, contents)]
