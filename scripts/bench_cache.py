@@ -35,6 +35,7 @@ def main() -> None:
     parser.add_argument("--length", type=int, default=24, help="frames of a window")
     parser.add_argument("--windows", type=int, default=6, help="decoded a round; of a cache 20 times as many")
     parser.add_argument("--steps", type=int, default=100, help="of training, for its memory")
+    parser.add_argument("--most", type=int, default=100, help="times the cache, for training's memory: 1, 10 or 100")
     parser.add_argument("--scratch", type=Path, help="folder for the datasets that hold it many times")
     parser.add_argument("--memory_only", action="store_true")
     parser.add_argument("--json", type=Path)

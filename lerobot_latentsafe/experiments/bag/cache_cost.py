@@ -42,6 +42,7 @@ class CacheCost:
         length: frames of a window.
         windows: decoded a round; of a cache 20 times as many.
         steps: of training, for its memory.
+        most: times the cache, of which training's memory is measured.
         scratch: folder for datasets that hold it many times; None: the system's for such files.
     """
 
@@ -51,6 +52,7 @@ class CacheCost:
     length: int
     windows: int
     steps: int
+    most: int = 100
     scratch: Path | None = None
 
 
@@ -127,10 +129,10 @@ def speeds(options: CacheCost, wide: FrameCache, narrow: FrameCache) -> dict[str
     return {name: values[1:] for name, values in found.items()}
 
 
-def many(cache: Path, folder: Path) -> Iterator[tuple[int, Path]]:
-    """A cached dataset, and datasets that hold it ten and a hundred times: their caches are its shards, linked."""
+def many(cache: Path, folder: Path, most: int) -> Iterator[tuple[int, Path]]:
+    """A cached dataset, and datasets that hold it 10 and 100 times, if that is at most `most`: they link its shards."""
     yield 1, cache
-    for times in (COPIES, COPIES**2):
+    for times in (n for n in (COPIES, COPIES**2) if n <= most):
         meta = LeRobotDatasetMetadata("local/cache", root=cache)
         cache = folder / f"{times}x"
         join_all([meta] * COPIES, [FrameCache.open(meta.root)] * COPIES, "local/cache", cache)
@@ -140,7 +142,10 @@ def many(cache: Path, folder: Path) -> Iterator[tuple[int, Path]]:
 def measure_memory(options: CacheCost) -> dict:
     """Of training on these."""
     with tempfile.TemporaryDirectory(dir=options.scratch) as folder:
-        found = {f"{n}x": memory_of_training(root, options.steps) for n, root in many(options.cache, Path(folder))}
+        found = {}
+        for n, root in many(options.cache, Path(folder), options.most):
+            found[f"{n}x"] = memory_of_training(root, options.steps)
+            print(n, found[f"{n}x"], file=sys.stderr, flush=True)
     contract = Contract.read(LeRobotDatasetMetadata("local/cache", root=options.cache))
     n, numbers = len(contract.episode), (contract.episode, contract.state, contract.action)
     return {
