@@ -203,9 +203,11 @@ def test_a_task_list_that_changed_is_refused(dataset_root, broken, tmp_path):
     with pytest.raises(FileExistsError, match="exists already"):
         build.lay_out(N)  # it is finished
     (broken / "frame_cache" / "manifest.json").unlink()
-    with pytest.raises(FileExistsError, match=r"another --tasks\.number \(it is cut for --tasks\.number=4\); give the"):
+    with pytest.raises(
+        FileExistsError, match=r"another number of shards \(it is cut for --tasks\.number=4\); give the"
+    ):
         build.lay_out(5)
-    with pytest.raises(FileExistsError, match=r"another --dataset\.episodes; give the same"):
+    with pytest.raises(FileExistsError, match=r"another choice of episodes; give the same"):
         build.lay_out(N, [0, 1, 2, 3])
     with pytest.raises(FileExistsError, match="another size or encoder; give the same"):
         build_of(dataset_root, broken, image_size=16).lay_out(N)

@@ -26,8 +26,8 @@ from lerobot_latentsafe.runtime.files import replacing, replacing_folder, scratc
 
 LAYOUT = "layout.json"
 WORDS = {
-    "dataset": "dataset", "arrays": "size or encoder", "recipe": "size or encoder", "episodes": "--dataset.episodes",
-    "shards": "--tasks.number",
+    "dataset": "dataset", "arrays": "size or encoder", "recipe": "size or encoder", "episodes": "choice of episodes",
+    "shards": "number of shards",
 }  # fmt: skip
 """Entry of a layout -> what differs if it differs."""
 
@@ -88,7 +88,8 @@ class Layout:
         differing = {WORDS[name]: name for name in WORDS if getattr(self, name) != getattr(expected, name)}
         if not differing:
             return
-        cut = f" (it is cut for --tasks.number={self.shards})" if "shards" in differing.values() else ""
+        known = f"it is cut for --tasks.number={self.shards}" if self.shards else "it is in one piece"
+        cut = f" ({known})" if "shards" in differing.values() else ""
         raise FileExistsError(
             f"{folder} holds an unfinished cache of another {', '.join(differing)}{cut}; give the same to go on with "
             "it, or choose another --output_dir"
