@@ -2,7 +2,7 @@
 """All that matters on a GPU, in ten minutes and without a dataset: random clips at the papers' sizes, random weights.
 
     train_rssm      frames a second of training the RSSM of configs/dubins_rssm_paper.yaml: single precision, TF32,
-                    bfloat16, and bfloat16 compiled; and the lines at which a step makes the host wait for the GPU
+                    bfloat16, and bfloat16 with its cell compiled; and the lines at which a step waits for the GPU
     train_dino_wm   the same of configs/bag_dino_wm_paper.yaml, on tokens of two cameras
     reachability    imagined transitions, and updates of critic and actor, a second
     encode          frames of two cameras a second through a transformer of DINOv2's size (ViT-S/14, 224 pixels)

@@ -30,7 +30,7 @@ from lerobot_latentsafe.datasets.clips import Clip
 from lerobot_latentsafe.datasets.frame_cache import FrameCacheError, basis_file
 from lerobot_latentsafe.encoders.perception import Perception, PerceptionConfig
 from lerobot_latentsafe.latent import Latent
-from lerobot_latentsafe.runtime.distributed import from_first_rank, mean_over_ranks
+from lerobot_latentsafe.runtime.distributed import from_first_rank, mean_over_ranks, world_size
 from lerobot_latentsafe.world_models.base import WorldModelConfig
 from lerobot_latentsafe.world_models.frame_transformer import FrameTransformer
 from lerobot_latentsafe.world_models.patch_summary import PatchSummary
@@ -514,7 +514,10 @@ class DinoWM(TerminationHead):
     def _last_observed(self, clip: Clip) -> int:
         """Index of the last frame seen before imagination takes over; random in training."""
         most = min(self.config.observed, clip.state.shape[1] - 1)
-        return int(from_first_rank(torch.randint(most, (), device=clip.state.device))) if self.training else most - 1
+        if not self.training:
+            return most - 1
+        device = clip.state.device if world_size() > 1 else "cpu"  # alone it need not wait for a GPU
+        return int(from_first_rank(torch.randint(most, (), device=device)))
 
     def _imagine(self, ahead: _Ahead, clip: Clip, seen: Tensor, last: int) -> Latent:
         """Frames (B, N, ...) after `last`; the first of them is what teacher forcing has predicted."""
