@@ -120,7 +120,8 @@ class LatentSafePolicy(PreTrainedPolicy):
             keep_freed_memory()
         with self.model.single_precision():
             loss, _, metrics = self.model.clip_loss(self.reader.read(batch, self.model))
-        return loss, {name: torch.as_tensor(value).item() for name, value in metrics.items()}
+        told = torch.stack([torch.as_tensor(value, device=loss.device).float() for value in metrics.values()])
+        return loss, dict(zip(metrics, told.tolist()))  # a GPU is waited for once
 
     # -- deployment ---
 

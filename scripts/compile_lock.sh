@@ -13,7 +13,8 @@ compiled=$(mktemp)
 trap 'rm -f "$compiled"' EXIT
 cp requirements.lock "$compiled"
 "$uv" pip compile --quiet --universal --python-version 3.12 --no-annotate --no-header --no-emit-index-url \
-  --extra dev --extra docs --extra ground-truth --extra label --extra onnx --output-file "$compiled" "$@" pyproject.toml >/dev/null
+  --extra cluster --extra dev --extra docs --extra ground-truth --extra label --extra onnx --output-file "$compiled" "$@" \
+  pyproject.toml >/dev/null
 
 # uv repeats the list of platforms on every line. What every platform needs carries no marker here.
 cpython="platform_python_implementation != 'PyPy' and "

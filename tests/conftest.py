@@ -30,7 +30,13 @@ settings.load_profile("suite")
 logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
 
 
-LONGEST = ("test_distributed.py", "test_pretrained.py", "test_labeling_page.py", "test_token_cache.py")
+LONGEST = (
+    "test_distributed.py",
+    "test_pretrained.py",
+    "test_labeling_page.py",
+    "test_token_cache.py",
+    "test_sharded_cache.py",
+)
 
 
 def pytest_collection_modifyitems(items):

@@ -406,7 +406,9 @@ def test_a_cache_of_other_episodes_is_not_gone_on_with(some, dataset_root, tmp_p
     unfinished = shutil.copytree(some, tmp_path / "cache")
     (unfinished / "frame_cache" / "manifest.json").unlink()
     options = [f"--dataset.repo_id={tiny.REPO_ID}", f"--dataset.root={dataset_root}", f"--output_dir={unfinished}"]
-    assert "unfinished cache of another dataset" in fails(capsys, "cache", *options, "--dataset.episodes=[1,2]")
+    assert "unfinished cache of another choice of episodes" in fails(
+        capsys, "cache", *options, "--dataset.episodes=[1,2]"
+    )
     main(["cache", *options, "--dataset.episodes=[2,3,5,9,11]"])
     assert (unfinished / "frame_cache" / "manifest.json").exists()
 

@@ -13,7 +13,7 @@ import torch
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_latentsafe.datasets import build_cache
+from lerobot_latentsafe.datasets import build_cache, cache_layout, cache_recipes
 from lerobot_latentsafe.datasets.build_cache import build_frame_cache
 from lerobot_latentsafe.datasets.frame_cache import FrameCache, FrameCacheError, dataset_fingerprint
 from lerobot_latentsafe.datasets.labels import FailureLabels
@@ -175,8 +175,12 @@ def test_manifest_of_another_shape_is_a_clear_error(torn):
 
 
 @pytest.mark.parametrize(
-    "step", ["_without_cameras", "allocate", "_layout", "_write", "_await_layout", "_array", "_finish"]
-)
+    "step",
+    [
+        (cache_layout, "_without_cameras"), (build_cache, "allocate"), (cache_layout, "_write"),
+        (build_cache, "_await_layout"), (build_cache, "_array"), (build_cache, "_finish"),
+    ],
+)  # fmt: skip
 @pytest.mark.parametrize("episodes", [None, [1, 3]], ids=["all", "some"])
 def test_build_killed_at_any_step_ends_as_one_that_was_not(dataset_root, tmp_path, monkeypatch, step, episodes):
     dataset = LeRobotDataset(tiny.REPO_ID, root=dataset_root)
@@ -185,7 +189,7 @@ def test_build_killed_at_any_step_ends_as_one_that_was_not(dataset_root, tmp_pat
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(build_cache, step, killed)
+        patch.setattr(*step, killed)
         build_frame_cache(dataset, tmp_path / "cut", 8, episodes=episodes)
     build_frame_cache(dataset, tmp_path / "cut", 8, episodes=episodes)
     build_frame_cache(dataset, tmp_path / "whole", 8, episodes=episodes)
@@ -209,7 +213,7 @@ def test_a_full_disk_is_an_error_before_any_frame_is_decoded(dataset_root, tmp_p
         pytest.raises(OSError, match=r"No space left.* are free\. Make room and start"),
     ):
         patch.setattr(os, "posix_fallocate", full, raising=False)
-        patch.setattr(build_cache.Sight, "pieces", None)
+        patch.setattr(cache_recipes.Sight, "pieces", None)
         build_frame_cache(dataset, tmp_path / "cache", 8)
     assert not (tmp_path / "cache").exists()
     build_frame_cache(dataset, tmp_path / "cache", 8)

@@ -11,7 +11,7 @@ import tiny
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_latentsafe.datasets import build_cache
+from lerobot_latentsafe.datasets import cache_recipes
 from lerobot_latentsafe.datasets.build_cache import build_frame_cache
 from lerobot_latentsafe.datasets.frame_cache import FrameCache, FrameCacheError
 from lerobot_latentsafe.encoders.patch_encoders import EncoderError
@@ -56,7 +56,7 @@ def test_eight_bits_err_by_less_than_a_hundredth(dataset, token_root, tmp_path):
 
 
 def test_killed_build_goes_on_and_equals_an_undisturbed_one(dataset, token_root, tmp_path, monkeypatch):
-    pieces, begun = build_cache.Sight.pieces, []
+    pieces, begun = cache_recipes.Sight.pieces, []
 
     def killed(self, place, numbers=None):
         begun.extend([place] if numbers is None else [])
@@ -65,7 +65,7 @@ def test_killed_build_goes_on_and_equals_an_undisturbed_one(dataset, token_root,
             if len(begun) == 4:  # in the middle of an episode
                 raise KeyboardInterrupt
 
-    monkeypatch.setattr(build_cache.Sight, "pieces", killed)
+    monkeypatch.setattr(cache_recipes.Sight, "pieces", killed)
     with pytest.raises(KeyboardInterrupt):
         build_frame_cache(dataset, tmp_path / "cut", tiny.TOKEN_SIZE, tiny.tokens())
     with pytest.raises(FrameCacheError, match="cut off"):
@@ -155,16 +155,16 @@ def test_folder_with_something_else_is_left_alone(dataset, tmp_path):
 
 
 def test_build_killed_before_its_first_episode_starts_anew(dataset, token_root, tmp_path, monkeypatch):
-    prepare = build_cache.Tokens.prepare
+    prepare = cache_recipes.Tokens.prepare
 
     def killed(*args):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(build_cache.Tokens, "prepare", killed)
+    monkeypatch.setattr(cache_recipes.Tokens, "prepare", killed)
     with pytest.raises(KeyboardInterrupt):
         build_frame_cache(dataset, tmp_path / "new", tiny.TOKEN_SIZE, tiny.tokens())
     assert not (tmp_path / "new").exists()
-    monkeypatch.setattr(build_cache.Tokens, "prepare", prepare)
+    monkeypatch.setattr(cache_recipes.Tokens, "prepare", prepare)
     build_frame_cache(dataset, tmp_path / "new", tiny.TOKEN_SIZE, tiny.tokens())
     assert [path.name for path in tmp_path.iterdir()] == ["new"]
     np.testing.assert_array_equal(arrays(tmp_path / "new")["vector"], arrays(token_root)["vector"])
@@ -175,7 +175,7 @@ def test_cache_of_another_version_says_so(token_root, tmp_path):
 
     copy = shutil.copytree(token_root, tmp_path / "old")
     tiny.rewrite_json(copy / "frame_cache" / "manifest.json", version=1)
-    with pytest.raises(FrameCacheError, match=r"is of version 1, this package reads version 2; delete it"):
+    with pytest.raises(FrameCacheError, match=r"is of version 1, this package reads versions 2 and 3; delete it"):
         FrameCache.open(copy)
 
 
@@ -271,7 +271,7 @@ def test_a_basis_of_before_class_tokens_were_kept_is_refused(dataset, component_
 def test_large_tokens_are_sampled_less(dataset, token_root, tmp_path, monkeypatch):
     """At the paper's sizes a frame is 768 kB: what principal components are found in must fit in memory."""
     sampled, fit = [], Perception.fit
-    monkeypatch.setattr(build_cache, "SAMPLED_BYTES", 100 * 4 * 448)
+    monkeypatch.setattr(cache_recipes, "SAMPLED_BYTES", 100 * 4 * 448)
     monkeypatch.setattr(Perception, "fit", lambda self, seen: sampled.append(len(seen.tokens)) or fit(self, seen))
     build_frame_cache(dataset, tmp_path / "new", tiny.TOKEN_SIZE, tiny.tokens())
     assert 100 <= sampled[0] < 100 + dataset.num_episodes

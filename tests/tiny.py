@@ -47,7 +47,7 @@ def tokens(**changes):
     """Recipe of a token cache with the offline encoder."""
     from functools import partial
 
-    from lerobot_latentsafe.datasets.build_cache import Tokens
+    from lerobot_latentsafe.datasets.cache_recipes import Tokens
 
     return partial(Tokens, **{"config": perception_config(), **changes})
 

@@ -72,6 +72,7 @@ VERBS: dict[str, Verb] = {
     "guard": Verb("train", _GUARD, "Guard", "make a guard of recorded episodes, without labels or training"),
     "monitor": Verb("train", _GUARD, "Monitor", "fit a monitor to a filter that says when the scene is unknown"),
     "cache": Verb("train", _TRAIN, "Cache", "decode a dataset's frames once, so that training does not have to"),
+    "join-caches": Verb("train", _TRAIN, "JoinCaches", "make one cached dataset of several, without copying frames"),
     "train-margin": Verb("train", _TRAIN, "TrainMargin", "fit the failure margin to labels on a frozen world model"),
     "train-reachability": Verb(
         "train", _TRAIN, "TrainReachability", "learn the safety value and the fallback in a world model's imagination"

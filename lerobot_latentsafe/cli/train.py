@@ -20,11 +20,14 @@ from lerobot_latentsafe.cli.options import CACHE_THEM, DatasetSource
 from lerobot_latentsafe.cli.places import PolicySource
 from lerobot_latentsafe.conformal import fixed_sequence, needed_for_sure, proven
 from lerobot_latentsafe.constraints import LikenessConfig
-from lerobot_latentsafe.datasets.build_cache import TOKEN_COMPONENTS, TOKEN_TYPES, Pictures, Tokens, build_frame_cache
+from lerobot_latentsafe.datasets.build_cache import MakeRecipe, build_frame_cache
+from lerobot_latentsafe.datasets.cache_recipes import TOKEN_COMPONENTS, TOKEN_TYPES, Pictures, Tokens
+from lerobot_latentsafe.datasets.cache_tasks import ShardedBuild, build_sharded_cache
 from lerobot_latentsafe.datasets.clips import ClipReader
 from lerobot_latentsafe.datasets.episode_groups import groups_of, weights_of
 from lerobot_latentsafe.datasets.fingerprints import episode_marks, refuse_trained_on
 from lerobot_latentsafe.datasets.frame_cache import FrameCache
+from lerobot_latentsafe.datasets.join_caches import join_caches
 from lerobot_latentsafe.encoders.perception import PerceptionConfig
 from lerobot_latentsafe.evaluation.decision_values import decision_values
 from lerobot_latentsafe.evaluation.rollouts import failures_by_epsilon
@@ -36,6 +39,7 @@ from lerobot_latentsafe.runtime import distributed
 from lerobot_latentsafe.runtime.files import refuse_existing, replacing_folder
 from lerobot_latentsafe.runtime.hub import save_policy
 from lerobot_latentsafe.runtime.options import require_at_least
+from lerobot_latentsafe.runtime.tasks import Tasks
 from lerobot_latentsafe.training import load_with_cache, train_margin, train_reachability
 
 
@@ -47,7 +51,10 @@ class Cache:
 
     For an RSSM that is each frame, decoded and resized. With --encoder it is the tokens of a frozen encoder and their
     principal components, for a token world model (gru, dino_wm). If a build was killed, start it again: it goes on.
-    `torchrun --nproc_per_node=N $(which latentsafe) cache ...` shares the work among processes.
+    `torchrun --nproc_per_node=N $(which latentsafe) cache ...` shares the work among processes of one computer.
+
+    With --tasks.number=N the cache is made in N shards, by --tasks.workers processes here, or by Slurm or Ray. A shard
+    that is done stays. docs/scaling.md shows a file of options for a cluster.
     """
 
     output_dir: Path
@@ -64,6 +71,7 @@ class Cache:
     """How tokens are stored: float16, or int8 with a scale for each token."""
     basis_from: Path | None = None
     """Another cache, whose principal components to use: one world model must read all its data by the same."""
+    tasks: Tasks = field(default_factory=Tasks)
 
     def __post_init__(self) -> None:
         require_at_least("--image_size", self.image_size, 1)
@@ -73,17 +81,31 @@ class Cache:
 
     def run(self) -> None:
         """Build the cache, or go on building it."""
-        recipe = Pictures
-        if self.encoder:
-            config = PerceptionConfig(encoder=self.encoder, token_components=self._token_components())
-            recipe = partial(Tokens, config=config, dtype=self.dtype, basis_from=self.basis_from)
-        cache = build_frame_cache(
-            self.dataset.opened(), self.output_dir, self.image_size, recipe, self.dataset.episodes
-        )
+        cache = self._in_shards() if self.tasks.number else self._whole()
         if cache is None:
             return  # another process finishes
         print(f"{cache.manifest['n_frames']} frames at {cache.image_size} px in {self.output_dir}")
         print(f"train with --dataset.repo_id={cache.manifest['repo_id']}_cache --dataset.root={self.output_dir}")
+
+    def _whole(self) -> FrameCache | None:
+        dataset = self.dataset.opened()
+        return build_frame_cache(dataset, self.output_dir, self.image_size, self._recipe(), self.dataset.episodes)
+
+    def _in_shards(self) -> FrameCache | None:
+        self.tasks.require_executor()
+        meta, output_dir = self.dataset.metadata(), self.output_dir.absolute()
+        build = ShardedBuild(meta.repo_id, Path(meta.root).absolute(), output_dir, self.image_size, self._recipe())
+        cache = build_sharded_cache(build, self.tasks, self.dataset.episodes)
+        if cache is None:
+            print(f"submitted: the last task finishes {output_dir}; logs are in {output_dir}.tasks")
+        return cache
+
+    def _recipe(self) -> MakeRecipe:
+        if not self.encoder:
+            return Pictures
+        config = PerceptionConfig(encoder=self.encoder, token_components=self._token_components())
+        basis_from = self.basis_from and self.basis_from.absolute()
+        return partial(Tokens, config=config, dtype=self.dtype, basis_from=basis_from)
 
     def _token_components(self) -> int:
         if self.token_components is not None:
@@ -91,6 +113,31 @@ class Cache:
         if self.basis_from is None:
             return TOKEN_COMPONENTS
         return FrameCache.open(self.basis_from).manifest.get("token_components", 0)
+
+
+@dataclass
+class JoinCaches:
+    """Make one cached dataset of several, to train on all of them; what was perceived is linked, not copied.
+
+    latentsafe join-caches --sources='[data/bag_tokens,data/lift_tokens]' --repo_id=me/all --output_dir=data/all_tokens
+
+    LeRobot's training takes one dataset at a time: it refuses --dataset.repo_id='[a,b]'. Caches must be alike: the same
+    cameras, sizes and encoder, and with an encoder the same principal components (latentsafe cache --basis_from).
+    Labels come along.
+    """
+
+    sources: list[Path]
+    """Folders of cached datasets."""
+    repo_id: str
+    """The id of the new one."""
+    output_dir: Path
+    """The folder to write."""
+
+    def run(self) -> None:
+        """Join."""
+        cache = join_caches(self.sources, self.repo_id, self.output_dir)
+        print(f"{cache.manifest['n_frames']} frames of {len(self.sources)} datasets in {self.output_dir}")
+        print(f"train with --dataset.repo_id={self.repo_id} --dataset.root={self.output_dir}")
 
 
 @dataclass

@@ -1,7 +1,8 @@
 """Frames decoded once: training reads a memory map instead of decoding images at every step.
 
 A cache lies in `frame_cache/` in a copy of the dataset without its images (see `build_cache.py`): one array for each
-thing that a world model perceives, keyed by the dataset's frame index. That is each camera's picture at the world
+thing that a world model perceives, or several, one after the other (see `cache_shards.py`), keyed by the dataset's
+frame index. That is each camera's picture at the world
 model's resolution, or a frozen encoder's tokens. `lerobot-train --dataset.root=<copy>` finds it by itself. Windows are
 cut the same way as LeRobot cuts them, so the losses equal those of decoding.
 """
@@ -16,14 +17,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lerobot_latentsafe.datasets.cache_shards import FrameCacheError, ShardedArray, check_digests, open_shards
+
 if TYPE_CHECKING:  # the package imports this module, and LeRobot's datasets are heavy
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
-FOLDER, MANIFEST, BASIS, VERSION = "frame_cache", "manifest.json", "basis.safetensors", 2
-
-
-class FrameCacheError(ValueError):
-    """A frame cache that is torn, of another dataset, resolution or encoder."""
+FOLDER, MANIFEST, BASIS = "frame_cache", "manifest.json", "basis.safetensors"
+VERSION, SHARDED = 2, 3
+"""Of the manifest of a cache in one piece, and of one in shards."""
 
 
 def dataset_fingerprint(meta: "LeRobotDatasetMetadata") -> str:
@@ -49,8 +50,8 @@ class FrameCache:
         manifest: what it was made from.
     """
 
-    percepts: dict[str, np.ndarray | Tensor]
-    scales: dict[str, np.ndarray]
+    percepts: dict[str, np.ndarray | ShardedArray | Tensor]
+    scales: dict[str, np.ndarray | ShardedArray]
     state: np.ndarray
     action: np.ndarray
     manifest: dict
@@ -60,7 +61,8 @@ class FrameCache:
         """Open the cache in a dataset's folder, checking it against the dataset's metadata.
 
         Raises:
-            FrameCacheError: no manifest (a build was cut off), arrays of other sizes, or another dataset.
+            FrameCacheError: no manifest (a build was cut off), arrays of other sizes, another dataset, or a shard that
+                is missing, torn, of another encoder, or twice in the index.
         """
         folder = Path(root) / FOLDER
         try:
@@ -71,27 +73,38 @@ class FrameCache:
                 f"{folder} has no readable {MANIFEST}; the build was cut off. Run the same latentsafe cache "
                 "again, which goes on where it stopped, or delete it"
             ) from e
-        if version != VERSION:
+        if version not in (VERSION, SHARDED):
             raise FrameCacheError(
-                f"{folder} is of version {version}, this package reads version {VERSION}; delete it and run latentsafe "
-                "cache again"
+                f"{folder} is of version {version}, this package reads versions {VERSION} and {SHARDED}; delete it and "
+                "run latentsafe cache again"
             )
         if meta is not None and fingerprint != dataset_fingerprint(meta):
             raise FrameCacheError(
                 f"{folder} was made from {manifest['repo_id']} ({manifest['fingerprint']}), the dataset is "
                 f"{meta.repo_id} ({dataset_fingerprint(meta)}); run latentsafe cache on this dataset"
             )
+        shards = open_shards(folder, manifest) if version == SHARDED else {}
+        read = lambda name: shards[name] if name in shards else np.load(folder / f"{name}.npy", mmap_mode="r")  # noqa: E731
         try:
-            percepts = {k: np.load(folder / f"{k}.npy", mmap_mode="r") for k in manifest["percepts"]}
-            eight_bits = [k for k, v in percepts.items() if v.dtype == np.int8]
-            scales = {k: np.load(scale_file(folder, k), mmap_mode="r") for k in eight_bits}
-            state, action = (np.load(folder / f"{k}.npy", mmap_mode="r") for k in ("state", "action"))
+            percepts = {k: read(k) for k in manifest["percepts"]}
+            scales = {k: read(f"{k}.scale") for k, v in percepts.items() if v.dtype == np.int8}
+            state, action = (read(k) for k in ("state", "action"))
         except (OSError, ValueError, EOFError) as e:
             raise FrameCacheError(f"{folder} is torn ({e}); delete it and run latentsafe cache again") from e
         lengths = {len(a) for a in (*percepts.values(), *scales.values(), state, action)}
         if lengths != {manifest["n_frames"]}:
             raise FrameCacheError(f"{folder} holds arrays of {sorted(lengths)} frames, not {manifest['n_frames']}")
         return cls(percepts, scales, state, action, manifest)
+
+    @staticmethod
+    def check_content(root: str | Path) -> None:
+        """Read all shards in a dataset's folder, and compare them with their digests; a cache in one piece has none.
+
+        Raises:
+            FrameCacheError: one holds something else than was written.
+        """
+        folder = Path(root) / FOLDER
+        check_digests(folder, json.loads((folder / MANIFEST).read_text()))
 
     @property
     def image_size(self) -> int:

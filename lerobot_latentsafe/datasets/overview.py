@@ -62,11 +62,12 @@ def cached_cameras(meta: LeRobotDatasetMetadata) -> list[Row]:
     """The cameras whose frames are cached in the dataset's folder.
 
     Raises:
-        FrameCacheError: a torn cache, or one of another dataset.
+        FrameCacheError: a torn cache, one of another dataset, or a shard that is not what was written.
     """
     if not (meta.root / FOLDER).exists():
         return []
     manifest = FrameCache.open(meta.root, meta).manifest
+    FrameCache.check_content(meta.root)
     size = manifest["image_size"]
     return [("camera", f"{key}: cached at {size} x {size} pixels") for key in manifest["cameras"]]
 

@@ -30,7 +30,7 @@ from lerobot_latentsafe.datasets.clips import Clip
 from lerobot_latentsafe.datasets.frame_cache import FrameCacheError, basis_file
 from lerobot_latentsafe.encoders.perception import Perception, PerceptionConfig
 from lerobot_latentsafe.latent import Latent
-from lerobot_latentsafe.runtime.distributed import from_first_rank, mean_over_ranks
+from lerobot_latentsafe.runtime.distributed import from_first_rank, mean_over_ranks, world_size
 from lerobot_latentsafe.world_models.base import WorldModelConfig
 from lerobot_latentsafe.world_models.frame_transformer import FrameTransformer
 from lerobot_latentsafe.world_models.patch_summary import PatchSummary
@@ -459,7 +459,7 @@ class DinoWM(TerminationHead):
 
     # -- learning ---
 
-    def loss(self, clip: Clip) -> tuple[Tensor, Tensor, dict[str, float]]:
+    def loss(self, clip: Clip) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
         """Errors one step ahead of frames that were seen (teacher forcing), and of the rest imagined open loop.
 
         The features are those of latents seen and, from where imagination took over, of latents imagined. Episodes
@@ -484,7 +484,7 @@ class DinoWM(TerminationHead):
         """Without a memory, what follows a frame is not known without its patches."""
         return self.config.token_share if self.memory_dim else 1.0
 
-    def _part_loss(self, clip: Clip, names: list[str], last: int) -> tuple[Tensor, Tensor, dict[str, float]]:
+    def _part_loss(self, clip: Clip, names: list[str], last: int) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
         """Loss, features and metrics of clips of which `names` are predicted, and which are seen up to frame `last`."""
         percepts = {name: values for name, values in clip.percepts.items() if name != "tokens" or name in names}
         frames = {**self._looked_at(percepts), "state": clip.state}
@@ -495,14 +495,14 @@ class DinoWM(TerminationHead):
         unit = self._unit_of_change(frames, goes_on)
         begun = {name: value[:, : last + 2] for name, value in frames.items()}
         losses = self._errors(ahead.frames, begun, goes_on[:, known], slice(0, -1), unit)
-        metrics = {f"loss_{name}": value.item() for name, value in losses.items()}
+        metrics = {f"loss_{name}": value.detach() for name, value in losses.items()}
         loss = (last + 1) / (length - 1) * torch.stack(list(losses.values())).sum()
         context = F.pad(ahead.frames["context"], (0, 0, 1, 0)) * (seen[:, : last + 2] > 1)[..., None]
         if self.config.open_loop > 0:
             imagined = self._imagine(ahead, clip, seen, last)
             alive = goes_on[:, last:].cumprod(1).bool()
             losses = self._errors(imagined, frames, alive, slice(last, last + 1), unit)
-            metrics |= {f"loss_{name}_open_loop": value.item() for name, value in losses.items()}
+            metrics |= {f"loss_{name}_open_loop": value.detach() for name, value in losses.items()}
             loss = loss + self.config.open_loop * torch.stack(list(losses.values())).sum()
             for name, truth in frames.items():
                 ahead_of_last = torch.where(_like(alive, truth), imagined[name], truth[:, last + 1 :])
@@ -519,7 +519,10 @@ class DinoWM(TerminationHead):
     def _last_observed(self, clip: Clip) -> int:
         """Index of the last frame seen before imagination takes over; random in training."""
         most = min(self.config.observed, clip.state.shape[1] - 1)
-        return int(from_first_rank(torch.randint(most, (), device=clip.state.device))) if self.training else most - 1
+        if not self.training:
+            return most - 1
+        device = clip.state.device if world_size() > 1 else "cpu"  # alone it need not wait for a GPU
+        return int(from_first_rank(torch.randint(most, (), device=device)))
 
     def _imagine(self, ahead: _Ahead, clip: Clip, seen: Tensor, last: int) -> Latent:
         """Frames (B, N, ...) after `last`; the first of them is what teacher forcing has predicted."""

@@ -152,7 +152,7 @@ class FrameGRU(WorldModel):
         vector, state = ((latent[name] - seen[name]).square().sum(-1) for name in ("vector", "state"))
         return vector + state
 
-    def loss(self, clip: Clip) -> tuple[Tensor, Tensor, dict[str, float]]:
+    def loss(self, clip: Clip) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
         """Squared errors of all predicted frames, in units of what changes from one frame to the next."""
         length = clip.state.shape[1]
         observed = int(torch.randint(1, self.config.observed + 1, ()))
@@ -178,5 +178,5 @@ class FrameGRU(WorldModel):
         for name, unit in zip(names, units):
             error = (torch.stack([z[name] for z in predicted], 1) - seen[name]).square() * counts
             losses[f"loss_{name}"] = error.sum() / unit
-        metrics = {name: value.item() for name, value in losses.items()}
+        metrics = {name: value.detach() for name, value in losses.items()}
         return sum(losses.values()), torch.stack(rows, 1), metrics

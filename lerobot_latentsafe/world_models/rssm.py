@@ -259,7 +259,8 @@ class RSSM(TerminationHead):
 
     def _recur(self, h: Tensor, x: Tensor, action: Tensor) -> Tensor:
         u = F.silu(self.recurrent_norm(self.recurrent_in(torch.cat([x, action], -1))))
-        reset, candidate, update = self.gru_norm(self.gru(torch.cat([u, h], -1))).chunk(3, -1)
+        gates = self.gru_norm(self.gru(torch.cat([u, h], -1))).to(h.dtype)  # h stays as precise under autocast
+        reset, candidate, update = gates.chunk(3, -1)
         # The bias of -1 makes a fresh cell remember, as in DreamerV3.
         return torch.lerp(h, torch.tanh(torch.sigmoid(reset) * candidate), torch.sigmoid(update - 1))
 

@@ -1,22 +1,23 @@
-"""What the token cache costs and saves: bytes, rounding errors, reading speed against decoding video, memory at 10x."""
+"""What the token cache costs and saves: bytes, rounding errors, reading speed against decoding video, memory."""
 
 import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-from lerobot.datasets.dataset_tools import merge_datasets
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.scripts import lerobot_train
 
-from lerobot_latentsafe.datasets.build_cache import eight_bits
-from lerobot_latentsafe.datasets.frame_cache import FOLDER, MANIFEST, FrameCache, dataset_fingerprint, scale_file
+from lerobot_latentsafe.datasets.cache_recipes import eight_bits
+from lerobot_latentsafe.datasets.contract import Contract
+from lerobot_latentsafe.datasets.frame_cache import FrameCache, scale_file
+from lerobot_latentsafe.datasets.join_caches import join_all
 from lerobot_latentsafe.evaluation.statistics import provenance
 from lerobot_latentsafe.experiments.timing import cpu_seconds, ratio, spread
 from lerobot_latentsafe.pictures import to_model_images
@@ -41,6 +42,8 @@ class CacheCost:
         length: frames of a window.
         windows: decoded a round; of a cache 20 times as many.
         steps: of training, for its memory.
+        most: times the cache, of which training's memory is measured.
+        scratch: folder for datasets that hold it many times; None: the system's for such files.
     """
 
     videos: Path
@@ -49,6 +52,8 @@ class CacheCost:
     length: int
     windows: int
     steps: int
+    most: int = 100
+    scratch: Path | None = None
 
 
 def bytes_of(folder: Path, pattern: str) -> int:
@@ -124,25 +129,32 @@ def speeds(options: CacheCost, wide: FrameCache, narrow: FrameCache) -> dict[str
     return {name: values[1:] for name, values in found.items()}
 
 
-def tenfold(cache: Path, folder: Path) -> Path:
-    """A cached dataset that holds another one so many times."""
-    merge_datasets([LeRobotDataset("local/cache", root=cache)] * COPIES, "local/tenfold", folder)
-    (folder / FOLDER).mkdir()
-    manifest = json.loads((cache / FOLDER / MANIFEST).read_text())
-    for file in (cache / FOLDER).iterdir():
-        if file.suffix == ".safetensors":
-            (folder / FOLDER / file.name).write_bytes(file.read_bytes())
-        elif file.stem in (*manifest["percepts"], "state", "action"):
-            one = np.load(file, mmap_mode="r")
-            shape = (COPIES * len(one), *one.shape[1:])
-            many = np.lib.format.open_memmap(folder / FOLDER / file.name, mode="w+", dtype=one.dtype, shape=shape)
-            for i in range(COPIES):
-                many[i * len(one) : (i + 1) * len(one)] = one
-            many.flush()
-    meta = LeRobotDatasetMetadata("local/tenfold", root=folder)
-    changed = {"n_frames": meta.total_frames, "fingerprint": dataset_fingerprint(meta)}
-    (folder / FOLDER / MANIFEST).write_text(json.dumps({**manifest, **changed}))
-    return folder
+def many(cache: Path, folder: Path, most: int) -> Iterator[tuple[int, Path]]:
+    """A cached dataset, and datasets that hold it 10 and 100 times, if that is at most `most`: they link its shards."""
+    yield 1, cache
+    for times in (n for n in (COPIES, COPIES**2) if n <= most):
+        meta = LeRobotDatasetMetadata("local/cache", root=cache)
+        cache = folder / f"{times}x"
+        join_all([meta] * COPIES, [FrameCache.open(meta.root)] * COPIES, "local/cache", cache)
+        yield times, cache
+
+
+def measure_memory(options: CacheCost) -> dict:
+    """Of training on these."""
+    with tempfile.TemporaryDirectory(dir=options.scratch) as folder:
+        found = {}
+        for n, root in many(options.cache, Path(folder), options.most):
+            found[f"{n}x"] = memory_of_training(root, options.steps)
+            print(n, found[f"{n}x"], file=sys.stderr, flush=True)
+    contract = Contract.read(LeRobotDatasetMetadata("local/cache", root=options.cache))
+    n, numbers = len(contract.episode), (contract.episode, contract.state, contract.action)
+    return {
+        "training_steps": options.steps,
+        "training_memory_mb": found,
+        "frames": n,
+        "cache_bytes_a_frame": bytes_of(options.cache, "*.*") / n,
+        "numbers_bytes_a_frame": sum(values.nbytes for values in numbers) / n,
+    }
 
 
 def memory_of_training(root: Path, steps: int) -> dict[str, float]:
@@ -175,9 +187,6 @@ def measure(options: CacheCost) -> dict:
         narrow = narrow_cache(wide, Path(folder))
         size, error = sizes(options, wide, narrow), rounding_error(wide, narrow)
         speed = speeds(options, wide, narrow)
-        memory = {"1x": memory_of_training(options.cache, options.steps)}
-        large = tenfold(options.cache, Path(folder) / "tenfold")
-        memory[f"{COPIES}x"] = memory_of_training(large, options.steps)
     return {
         "frames": len(wide.state),
         "rounds": options.rounds,
@@ -186,8 +195,7 @@ def measure(options: CacheCost) -> dict:
         "relative_error_of_int8": error,
         "frames_a_cpu_second": {name: spread(values) for name, values in speed.items()},
         **{f"{name}_over_video": ratio(values, speed["video"]) for name, values in speed.items() if name != "video"},
-        "training_steps": options.steps,
-        "training_memory_mb": memory,
+        **measure_memory(options),
         **provenance([0]),
     }
 

@@ -9,7 +9,7 @@ import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_latentsafe.datasets.build_cache import write_manifest
+from lerobot_latentsafe.datasets.cache_layout import write_manifest
 from lerobot_latentsafe.datasets.clips import ClipReader
 from lerobot_latentsafe.datasets.contract import Contract
 from lerobot_latentsafe.datasets.frame_cache import FOLDER, FrameCache

@@ -13,8 +13,8 @@ from lerobot_latentsafe.datasets.clips import ClipReader
 CAMERA = "observation.image"
 
 
-def authors_modules(path: Path) -> SimpleNamespace:
-    """Import the authors' modules `models`, `tools` and `dreamer_offline`, made to run without a GPU."""
+def authors_modules(path: Path, device: str = "cpu") -> SimpleNamespace:
+    """Import the authors' modules `models`, `tools` and `dreamer_offline`, made to run on a device, such as the CPU."""
     missing = [name for name in ("configs.yaml", "dreamerv3-torch", "scripts") if not (path / name).exists()]
     if missing:
         raise SystemExit(f"--authors={path} lacks {', '.join(missing)}; give a clone of CMU-IntentLab/latent-safety")
@@ -26,16 +26,16 @@ def authors_modules(path: Path) -> SimpleNamespace:
     except ImportError as e:
         raise SystemExit(f"the authors' code needs {e.name}: pip install gym ruamel.yaml tensorboard wandb") from e
     # Two defaults name the GPU and are not reached by their `device` option.
-    networks.MLP.__init__.__defaults__ = tuple("cpu" if d == "cuda" else d for d in networks.MLP.__init__.__defaults__)
+    networks.MLP.__init__.__defaults__ = tuple(device if d == "cuda" else d for d in networks.MLP.__init__.__defaults__)
     return SimpleNamespace(models=models, tools=tools, dreamer=dreamer)
 
 
-def authors_config(tools: ModuleType, path: Path) -> argparse.Namespace:
-    """Their configs.yaml as their scripts read it, on the CPU and without videos."""
+def authors_config(tools: ModuleType, path: Path, device: str = "cpu") -> argparse.Namespace:
+    """Their configs.yaml as their scripts read it, on a device and without videos."""
     yaml = importlib.import_module("ruamel.yaml")  # which they need, and we do not
     defaults = yaml.YAML(typ="safe", pure=True).load((path / "configs.yaml").read_text())["defaults"]
     config = argparse.Namespace(**{key: tools.args_type(value)(value) for key, value in defaults.items()})
-    config.device, config.video_pred_log, config.num_actions = "cpu", False, 1
+    config.device, config.video_pred_log, config.num_actions = device, False, 1
     return config
 
 

@@ -116,10 +116,10 @@ def our_step(name: str, folder: Path, options: TrainingCost) -> Callable[[], Non
 # -- theirs ---
 
 
-def authors_step(folder: Path, options: TrainingCost) -> Callable[[], None]:
+def authors_step(folder: Path, options: TrainingCost, device: str = "cpu") -> Callable[[], None]:
     """One step of their pre-training loop."""
-    authors, gym = authors_modules(options.authors), importlib.import_module("gym")
-    config = authors_config(authors.tools, options.authors)
+    authors, gym = authors_modules(options.authors, device), importlib.import_module("gym")
+    config = authors_config(authors.tools, options.authors, device)
 
     authors.dreamer.Dreamer.fill_cache = lambda learner: None  # skip the thousands of figures they draw for a plot
     spaces = {
