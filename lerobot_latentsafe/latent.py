@@ -68,4 +68,5 @@ class Belief:
             observe: posterior, or None at the start -> that after the frame.
             history_frames: see `led_on`.
         """
-        return Belief(*map(observe, self.led_on(history_frames)), n_frames=self.n_frames + 1)
+        latent, younger = (*map(observe, self.led_on(history_frames)), None)[:2]
+        return Belief(latent, younger, self.n_frames + 1)

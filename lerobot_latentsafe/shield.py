@@ -365,7 +365,8 @@ class Shield:
         frame = Frame(percepts, shown, led, ahead)
         thought = self.nearest.thinking.think(latent, begins, frame, blind if blind.any() else None)
         parts = [map_latent(thought.latent, lambda t: t[i : i + len(state)]) for i in range(0, len(begins), len(state))]  # noqa: B023
-        return Belief(*parts, n_frames=before.n_frames + 1), thought
+        own, younger = (*parts, None)[:2]
+        return Belief(own, younger, before.n_frames + 1), thought
 
     def _fall_back(self, thought: Thought, hold: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The fallback (B, A) in robot units, and whether an override would be the retreat's: (B,)."""

@@ -94,7 +94,7 @@ class FrameCache:
         lengths = {len(a) for a in (*percepts.values(), *scales.values(), state, action)}
         if lengths != {manifest["n_frames"]}:
             raise FrameCacheError(f"{folder} holds arrays of {sorted(lengths)} frames, not {manifest['n_frames']}")
-        return cls(percepts, scales, state, action, manifest)
+        return cls(percepts, scales, np.asarray(state), np.asarray(action), manifest)
 
     @staticmethod
     def check_content(root: str | Path) -> None:

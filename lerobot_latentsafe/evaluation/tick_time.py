@@ -9,6 +9,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -120,7 +121,7 @@ def compare_engines(policy: LatentSafePolicy, fps: float, n_ticks: int) -> Itera
 @torch.no_grad()
 def measure(policy: LatentSafePolicy, fps: float, n_ticks: int) -> TickTimes:
     """Wall time of ticks of a policy with a `TimedShield`, each begun a period after the last, or when that ended."""
-    shield, shown = policy.shield, list(_shown(policy))
+    shield, shown = cast(TimedShield, policy.shield), list(_shown(policy))
     still, took = policy.model.units.still, shield.took
     with _collecting() as garbage:
         for i in range(WARM_UP + n_ticks):
@@ -155,7 +156,7 @@ def _collecting() -> Iterator[list[float]]:
         gc.callbacks.remove(note)
 
 
-def _shown(policy: LatentSafePolicy) -> Iterator[dict[str, Tensor]]:
+def _shown(policy: LatentSafePolicy) -> Iterator[dict[str, Any]]:
     """What a robot that stands somewhere shows, with pictures of noise."""
     config, model = policy.config, policy.model
     generator = torch.Generator().manual_seed(0)

@@ -5,7 +5,7 @@ import math
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -115,7 +115,8 @@ def milliseconds(call: Callable[[], object], device: torch.device, seconds: floa
     """Median and 99th percentile of calls that are waited for one by one."""
     for _ in range(3):
         call()
-    took, over = [], time.perf_counter() + seconds
+    took: list[float] = []
+    over = time.perf_counter() + seconds
     while len(took) < 3 or time.perf_counter() < over:
         _finish(device)
         began = time.perf_counter()
@@ -167,7 +168,8 @@ def preset(file: str) -> LatentSafeConfig:
 
 def rssm(sizes: Sizes) -> RSSMConfig:
     """The paper's RSSM."""
-    return replace(preset("dubins_rssm_paper.yaml").world_model, **sizes.rssm)
+    config: RSSMConfig = replace(preset("dubins_rssm_paper.yaml").world_model, **sizes.rssm)
+    return config
 
 
 def dino_wm(sizes: Sizes, device: torch.device) -> DinoWM:
@@ -176,7 +178,7 @@ def dino_wm(sizes: Sizes, device: torch.device) -> DinoWM:
     return DinoWM(config, CAMERAS, STATES, ACTIONS, sizes.patches, len(CAMERAS) * TOKEN).to(device)
 
 
-def random_clip(percepts: dict[str, tuple[int, ...]], batch: int, length: int, device: torch.device) -> Clip:
+def random_clip(percepts: Mapping[str, tuple[int, ...]], batch: int, length: int, device: torch.device) -> Clip:
     """Clips of noise, of which half fail at their end.
 
     Args:

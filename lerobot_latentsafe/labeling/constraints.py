@@ -80,7 +80,7 @@ def _require_familiar(
     """
     failing, likeness = np.flatnonzero(failure == FAILING), model.config.likeness
     low, high = (np.array(ends) / [*likeness.alike.values()] for ends in (likeness.low, likeness.high))
-    inside = ((where >= low - 1) & (where <= high + 1)).all(1)  # NaN is nowhere
+    inside: np.ndarray = ((where >= low - 1) & (where <= high + 1)).all(1)  # NaN is nowhere
     strange = failing[~inside[failing]]
     if not len(strange) and model.config.trained_on.looks and len(failing):
         strange = failing[_unfamiliar(model, frames, episode, failing)]

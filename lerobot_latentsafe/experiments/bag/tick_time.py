@@ -84,10 +84,10 @@ def write_times(path: str, base: str, ahead: int, n_rounds: int, n_steps: int, o
         variants |= {alone + suffix: (on, True), here + suffix: (on, False), elsewhere + suffix: (off, False)}
     ticks: dict[str, list[float]] = {name: [] for name in variants}
     for i in trange(n_rounds, unit="round"):
-        for name, (policy, alone) in variants.items():
+        for name, (policy, is_alone) in variants.items():
             scene.reset(FIRST_SEED + i)
             torch.manual_seed(i)
-            ticks[name] += episode(policy, scene, n_steps, alone)
+            ticks[name] += episode(policy, scene, n_steps, is_alone)
     rows = {name: in_ms(values, 1 / scene.fps) for name, values in ticks.items()}
     for name, values in rows.items():
         print(name, {key: round(value, 3) for key, value in values.items()})
