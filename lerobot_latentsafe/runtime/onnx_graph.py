@@ -59,7 +59,8 @@ class Graph:
         try:
             with torch.no_grad(), _quietly(), _symbolics():
                 torch.onnx.export(
-                    whole, tuple(example.values()), cast(Any, file), dynamo=False, opset_version=OPSET, input_names=list(example)
+                    whole, tuple(example.values()), cast(Any, file), dynamo=False, opset_version=OPSET,
+                    input_names=list(example),
                 )  # fmt: skip
             self._session = InferenceSession(file.getvalue(), _options(), providers=["CPUExecutionProvider"])
         except Exception as e:  # whatever the exporter and the runtime raise
