@@ -24,7 +24,7 @@ from lerobot_latentsafe.dubins import car
 from lerobot_latentsafe.dubins.ground_truth import solve_grid
 from lerobot_latentsafe.evaluation.rollouts import Choice, steps
 from lerobot_latentsafe.evaluation.statistics import confusion, provenance, run_resumable, wilson, write_json
-from lerobot_latentsafe.experiments.dubins.monitor import CarWorld, LatentMonitor
+from lerobot_latentsafe.experiments.dubins.monitor import LatentMonitor
 from lerobot_latentsafe.guard import standing_still
 from lerobot_latentsafe.latent import Latent
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
@@ -214,6 +214,27 @@ def improve_by_looking_ahead(policy: LatentSafePolicy, critic: SafetyCritic) -> 
 # -- what is measured ---
 
 
+class Cars:
+    """Cars in many states side by side, all of which drive on until the time is up; `info` holds the states (N, 3)."""
+
+    def __init__(self, starts: np.ndarray, n_steps: int):
+        self.info, self.left, self._gone = starts.copy(), n_steps, np.zeros(len(starts), bool)
+
+    @property
+    def over(self) -> np.ndarray:
+        """Which have left the camera's view, or all after the last step: bool (N,)."""
+        return self._gone | (self.left == 0)
+
+    def observe(self) -> np.ndarray:
+        """The states (N, 3), also of those that are out of view."""
+        return self.info
+
+    def step(self, turn_rates: np.ndarray) -> None:
+        """Drive on by turn rates (N,)."""
+        self.info, self.left = car.step(self.info, turn_rates), self.left - 1
+        self._gone = self._gone | ~car.in_view(self.info)
+
+
 def drive(policy: LatentSafePolicy | None, case: Case, starts: np.ndarray) -> dict[str, np.ndarray]:
     """Runs of a driver that heads for the nearest forbidden place, from each start, shielded if there is a filter.
 
@@ -235,8 +256,8 @@ def drive(policy: LatentSafePolicy | None, case: Case, starts: np.ndarray) -> di
         return Choice(decision.action.numpy()[:, 0].astype(float), decision)
 
     failed, changed, lived = np.zeros(len(starts), bool), np.zeros(len(starts)), np.zeros(len(starts))
-    for step in steps(CarWorld(starts, RUN), act):
-        states, _ = step.info
+    for step in steps(Cars(starts, RUN), act):
+        states = step.info
         failed |= step.alive & car.in_view(states) & (case.margin(states) < 0)
         lived += step.alive
         if step.decision is not None:
