@@ -227,11 +227,11 @@ def learn(
         usual = dynamics.learn(np.concatenate([episode.differences for episode in first]))
     nothing = np.ones(n_scores(len(library.mean), usual), np.float32)
     familiar = Familiar(library, background, usual, profile([nothing[None]], 1.0), nothing, np.zeros(1, np.float32))
+    familiar = Familiar.of(familiar.tensors())  # as it will be read from its file: what is left unsaid is small
     scores = [familiar.scores_of(*vars(episode).values()) for episode in second]
     familiar = familiar._replace(profile=profile(scores, smooth))
     scale = np.quantile([strangest(familiar, score) for score in scores], SCALED_AT, axis=0)
-    familiar = familiar._replace(scale=np.maximum(scale, 0.5).astype(np.float32))
-    familiar = Familiar.of(familiar.tensors())  # as it will be read from its file
+    familiar = Familiar.of(familiar._replace(scale=np.maximum(scale, 0.5).astype(np.float32)).tensors())
     most = [strangest(familiar, familiar.scores_of(*vars(episode).values())).max() for episode in third]
     return Familiar.of(familiar._replace(strangest=np.sort(most).astype(np.float32)).tensors())
 
