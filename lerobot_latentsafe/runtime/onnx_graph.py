@@ -156,9 +156,16 @@ def _gru_cell(g: Any, x: Any, hidden: Any, *weights: Any) -> Any:
     return g.op("Add", new, g.op("Mul", update, g.op("Sub", hidden, new)))
 
 
+@symbolic_helper.parse_args("v", "i", "i", "i")
+def _chunk(g: Any, x: Any, chunks: int, axis: int, _outputs: int | None = None) -> Any:
+    """Equal parts, also of sizes that the exporter does not know: where torch takes a GRUCell apart."""
+    return g.op("Split", x, axis_i=axis, outputs=chunks)
+
+
 _SYMBOLICS: dict[str, Callable] = {
     "aten::amax": _extreme("ReduceMax"),
     "aten::amin": _extreme("ReduceMin"),
     "aten::max": _max,
     "aten::gru_cell": _gru_cell,
+    "aten::unsafe_chunk": _chunk,
 }
