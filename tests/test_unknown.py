@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 import tiny
 import torch
+from safetensors.torch import load_file, save_file
 
 from lerobot_latentsafe.cli import main
 from lerobot_latentsafe.collection.dubins import random_episodes
@@ -393,6 +394,14 @@ def torn(folder):
     (folder / STATISTICS).write_bytes((folder / STATISTICS).read_bytes()[:1000])
 
 
+def without(entry):
+    def change(folder):
+        numbers = load_file(folder / STATISTICS)
+        save_file({name: tensor for name, tensor in numbers.items() if name != entry}, folder / STATISTICS)
+
+    return change
+
+
 def recorded_as(**changes):
     def change(folder):
         trained_on = json.loads((folder / "config.json").read_text())["trained_on"]
@@ -404,6 +413,7 @@ def recorded_as(**changes):
 SPOILED = {
     "its statistics are gone": (gone, "is missing"),
     "its statistics are torn": (torn, "is not readable"),
+    "it is of a version before": (without("background.0"), "lack 'background.0'; fit them again"),
     "it is of another camera": (recorded_as(cameras=["observation.images.wrist"]), "cameras"),
     "it is of another world model": (recorded_as(world_model="0" * 16), "world model"),
     "it is of other pictures": (recorded_as(image_size=96), "image_size"),

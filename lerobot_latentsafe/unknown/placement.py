@@ -47,9 +47,11 @@ class Background(NamedTuple):
 def learn(grey: np.ndarray) -> Background:
     """The background of grey pictures uint8 (N, C, H, W)."""
     mean = grey.mean(0).round().astype(np.float32) / 255  # as a file keeps it
-    slope = gradients(mean)
-    deviation = np.stack([gradients(camera.astype(np.float32) / 255).std(0) for camera in grey.swapaxes(0, 1)])
-    return Background(mean, np.abs(slope) > STILL * (deviation + LEAST))
+    slope, usual = gradients(mean), gradients(grey.mean(0) / 255)
+    square = np.zeros_like(usual)
+    for picture in grey:  # gradients of all pictures at once would fill the memory
+        square += np.square(gradients(picture.astype(np.float32) / 255) - usual)
+    return Background(mean, np.abs(slope) > STILL * (np.sqrt(square / len(grey)) + LEAST))
 
 
 def gradients(grey: np.ndarray) -> np.ndarray:
