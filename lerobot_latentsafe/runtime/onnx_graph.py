@@ -146,16 +146,6 @@ def _max(g: Any, x: Any, other: Any = None, keep: Any = None) -> Any:
     return largest, g.op("ArgMax", x, axis_i=axis, keepdims_i=keep)
 
 
-def _gru_cell(g: Any, x: Any, hidden: Any, *weights: Any) -> Any:
-    """torch's GRUCell: reset and update gates, and the new state."""
-    of_x, of_hidden, bias_of_x, bias_of_hidden = weights
-    told = g.op("Split", g.op("Gemm", x, of_x, bias_of_x, transB_i=1), axis_i=1, outputs=3)
-    kept = g.op("Split", g.op("Gemm", hidden, of_hidden, bias_of_hidden, transB_i=1), axis_i=1, outputs=3)
-    reset, update = (g.op("Sigmoid", g.op("Add", a, b)) for a, b in zip(told[:2], kept[:2]))
-    new = g.op("Tanh", g.op("Add", told[2], g.op("Mul", reset, kept[2])))
-    return g.op("Add", new, g.op("Mul", update, g.op("Sub", hidden, new)))
-
-
 @symbolic_helper.parse_args("v", "i", "i", "i")
 def _chunk(g: Any, x: Any, chunks: int, axis: int, _outputs: int | None = None) -> Any:
     """Equal parts, also of sizes that the exporter does not know: where torch takes a GRUCell apart."""
@@ -166,6 +156,5 @@ _SYMBOLICS: dict[str, Callable] = {
     "aten::amax": _extreme("ReduceMax"),
     "aten::amin": _extreme("ReduceMin"),
     "aten::max": _max,
-    "aten::gru_cell": _gru_cell,
     "aten::unsafe_chunk": _chunk,
 }
