@@ -14,6 +14,7 @@ from pathlib import Path
 
 from lerobot_latentsafe.decision import LawOptions
 from lerobot_latentsafe.experiments.bag.branching import explain_filters
+from lerobot_latentsafe.experiments.bag.command_line import named_paths
 from lerobot_latentsafe.experiments.filter_settings import FilterSetting
 
 
@@ -24,7 +25,7 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--output", type=Path, default=Path("results/assurance/misses.json"))
     given = parser.parse_args()
-    paths = dict(pair.split("=", 1) for pair in given.filters)
+    paths = named_paths(parser, "--filters", given.filters)
     settings = {name: FilterSetting.of(path, LawOptions()) for name, path in paths.items()}
     explain_filters(settings, given.n, given.output, given.workers)
 

@@ -13,6 +13,7 @@ world_models.png beside it shows one state's futures under three actions.
 import argparse
 from pathlib import Path
 
+from lerobot_latentsafe.experiments.bag.command_line import named_paths
 from lerobot_latentsafe.experiments.bag.world_models import compare_models
 
 
@@ -23,11 +24,7 @@ def main() -> None:
     parser.add_argument("--cost", type=Path, help="CSV file with a row world_model_NAME: step, user_s, system_s")
     parser.add_argument("--output", type=Path, default=Path("results/bag/world_models.json"))
     given = parser.parse_args()
-    wrong = [pair for pair in given.models if not all(pair.partition("="))]
-    if wrong:
-        parser.error(f"--models is {' '.join(wrong)}; expected NAME=PATH of each, such as gru=outputs/bag/final_0")
-    models = {name: path for name, _, path in (pair.partition("=") for pair in given.models)}
-    compare_models(models, given.data, given.output, given.cost)
+    compare_models(named_paths(parser, "--models", given.models), given.data, given.output, given.cost)
 
 
 if __name__ == "__main__":

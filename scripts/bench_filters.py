@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from lerobot_latentsafe.evaluation.statistics import provenance, write_json
+from lerobot_latentsafe.experiments.bag.command_line import named_paths
 
 QUANTILES = {"median": 0.5, "p99": 0.99}
 WORKER = """
@@ -107,7 +108,7 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--output", type=Path, default=Path("results/bag/bench_filters.json"))
     given = parser.parse_args()
-    paths = dict(pair.split("=", 1) for pair in given.filters)
+    paths = named_paths(parser, "--filters", given.filters)
     own = {f"{name}, {engine}": (path, engine) for name, path in paths.items() for engine in ("torch", "onnx")}
     workers = [Worker(Path(__file__).parents[1], own, given.root)]
     if given.old:

@@ -13,11 +13,13 @@ A recording cannot tell whether the way out was there: for that a simulator is b
 """
 
 import json
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from lerobot_latentsafe.datasets.clips import ClipReader
 from lerobot_latentsafe.datasets.labels import FAILING
@@ -109,8 +111,14 @@ def imagined_margin(model: SafetyModel, reader: ClipReader, episode: int, seen: 
     for t in range(observed):
         percepts = {key: value[:, t] for key, value in clip.percepts.items()}
         latent = world_model.observe(latent, clip.action[:, t], percepts, clip.state[:, t])
-    margins = []
-    for t in range(observed, observed + steps):
-        latent = model.imagination.follow(latent, clip.action[:, t])
-        margins.append(model.imagination.margin(latent).item())
+    return least_margin(model, latent, (clip.action[:, t] for t in range(observed, observed + steps)))
+
+
+@torch.no_grad()
+def least_margin(model: SafetyModel, latent: Latent, actions: Iterable[Tensor]) -> float:
+    """The least l on the way from a latent of one robot under the actions (1, K A) of steps, as they are heard."""
+    imagination, margins = model.imagination, []
+    for action in actions:
+        latent = imagination.follow(latent, action)
+        margins.append(imagination.margin(latent).item())
     return min(margins)

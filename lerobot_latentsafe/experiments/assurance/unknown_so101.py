@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from tqdm import trange
 
-from lerobot_latentsafe.experiments.assurance.unknown_study import FAULTS, first_alarms, summary, watched
+from lerobot_latentsafe.experiments.assurance.unknown_study import FAULTS, dark, first_alarms, moved, summary, watched
 from lerobot_latentsafe.experiments.so101 import FIRST_SEED, kept
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
 from lerobot_latentsafe.so101.actions import CAMERAS, EPISODE_SECONDS, FPS
@@ -41,18 +41,6 @@ def _geom(model: mujoco.MjModel, name: str) -> int:
     return model.body("cube").geomadr[0] if name == "cube" else model.geom(name).id
 
 
-def _dark(model: mujoco.MjModel) -> None:
-    for light in (model.light_diffuse, model.vis.headlight.diffuse, model.vis.headlight.ambient):
-        light[:] *= 0.6
-
-
-def _moved(camera: str, by: tuple[float, float, float]) -> Callable[[mujoco.MjModel], None]:
-    def change(model: mujoco.MjModel) -> None:
-        model.cam_pos[model.camera(camera).id] += by
-
-    return change
-
-
 KINDS: dict[str, Callable[[mujoco.MjModel], None]] = {
     HEALTHY: lambda model: None,
     "a blue cube": _coloured("cube", 0.12, 0.2, 0.85),
@@ -61,9 +49,9 @@ KINDS: dict[str, Callable[[mujoco.MjModel], None]] = {
     "a slippery cube": _cube(geom_friction=0.3),
     "a grey table": _coloured("table", 0.5, 0.5, 0.52),
     "a green floor": _coloured("floor", 0.2, 0.4, 0.2),
-    "dark": _dark,
-    "front camera moved by 2 cm": _moved("front", (0, 0.02, 0)),
-    "wrist camera moved by 1 cm": _moved("wrist", (0, 0.01, 0)),
+    "dark": dark,
+    "front camera moved by 2 cm": moved("front", (0, 0.02, 0)),
+    "wrist camera moved by 1 cm": moved("wrist", (0, 0.01, 0)),
 }
 """What is changed of the scene. None but the first was recorded."""
 

@@ -47,13 +47,14 @@ SHARES = {"rise": (0.5, 0, 0, 0, 0, 0, 0.5), "branch": (0.6, 0, 0, 0.2, 0, 0, 0.
 # -- what is new ---
 
 
-def _dark(model: mujoco.MjModel) -> None:
+def dark(model: mujoco.MjModel) -> None:
+    """Dim all lights of a scene."""
     for light in (model.light_diffuse, model.vis.headlight.diffuse, model.vis.headlight.ambient):
         light[:] *= 0.6
 
 
-def _moved(camera: str, by: tuple[float, float, float]) -> Callable[[mujoco.MjModel], None]:
-    """A camera moved in its frame's parent, m."""
+def moved(camera: str, by: tuple[float, float, float]) -> Callable[[mujoco.MjModel], None]:
+    """Move a camera in its frame's parent, m."""
 
     def change(model: mujoco.MjModel) -> None:
         model.cam_pos[model.camera(camera).id] += by
@@ -90,9 +91,9 @@ KINDS: dict[str, Kind] = {
     "green": Kind(Variant(colour="0.15 0.62 0.12")),
     "cloth": Kind(Variant(cloth=True)),
     "purple": Kind(Variant(colour="0.42 0.12 0.55")),
-    "dark": Kind(Variant(), _dark),
-    "front moved": Kind(Variant(), _moved("front", (0, 0.03, 0))),
-    "wrist moved": Kind(Variant(), _moved("wrist", (0.02, 0, 0))),
+    "dark": Kind(Variant(), dark),
+    "front moved": Kind(Variant(), moved("front", (0, 0.03, 0))),
+    "wrist moved": Kind(Variant(), moved("wrist", (0.02, 0, 0))),
     "second bag": Kind(Variant(beside=SECOND_BAG)),
     "hand": Kind(Variant(beside=HAND)),
 }

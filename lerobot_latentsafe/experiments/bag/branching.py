@@ -11,7 +11,6 @@ the first of these that holds is the cause (the causes of `evaluation.misses`):
     value        imagination foresees the spill, and the filter did not act
 """
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
@@ -21,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_latentsafe.evaluation.misses import CAUSES
+from lerobot_latentsafe.evaluation.misses import CAUSES, least_margin
 from lerobot_latentsafe.evaluation.rollouts import steps
 from lerobot_latentsafe.evaluation.statistics import provenance, run_resumable, write_json
 from lerobot_latentsafe.experiments.bag.out_of_distribution import MECHANICS, SEEN, recording
@@ -115,17 +114,11 @@ def cause_of(policy: LatentSafePolicy, run: Run, way_out: int | None) -> str | N
     return "value" if imagined_margin(policy, run, way_out, failed) <= 0 else "world_model"
 
 
-@torch.no_grad()
 def imagined_margin(policy: LatentSafePolicy, run: Run, seen: int, failed: int) -> float:
     """The least l on the way to tick `failed`, imagined from tick `seen` on under what was then executed."""
-    model, latent = policy.model, run.latents[seen]
-    skip, least = model.config.world_model.frame_skip, math.inf
-    for t in range(seen, failed, skip):
-        ahead = run.heard[t : t + skip]
-        ahead = torch.cat([ahead, ahead[-1:].expand(skip - len(ahead), -1)]).reshape(1, -1)
-        latent = model.imagination.follow(latent, ahead)
-        least = min(least, model.imagination.margin(latent).item())
-    return least
+    skip, last = policy.model.config.world_model.frame_skip, len(run.heard) - 1
+    ticks = (torch.arange(t, t + skip).clamp(max=last) for t in range(seen, failed, skip))
+    return least_margin(policy.model, run.latents[seen], (run.heard[some].reshape(1, -1) for some in ticks))
 
 
 @lru_cache(maxsize=2)

@@ -31,3 +31,15 @@ def filter_settings(arguments: Namespace, laws: list[str]) -> list[FilterSetting
     paths, changed = arguments.filters, {name: getattr(arguments, name) for name in DECIDES}
     pairs = [(path, laws[0]) for path in paths] + [(paths[0], law) for law in laws[1:]]
     return [FilterSetting.of(path, LawOptions(name=law, **changed)) for path, law in pairs]
+
+
+def named_paths(parser: ArgumentParser, option: str, pairs: list[str]) -> dict[str, str]:
+    """Name -> path, of pairs NAME=PATH; ends with a message where one is no pair.
+
+    Args:
+        option: that they were given to, such as `--models`.
+    """
+    wrong = [pair for pair in pairs if not all(pair.partition("="))]
+    if wrong:
+        parser.error(f"{option} is {' '.join(wrong)}; expected NAME=PATH of each, such as gru=outputs/bag/final_0")
+    return {name: path for name, _, path in (pair.partition("=") for pair in pairs)}
