@@ -5,7 +5,7 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 OUT=${1:-data}
 export HF_HUB_OFFLINE=1 OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
-for source in bag_mix bag_branches bag_climbs bag_lifts bag_between bag_dither bag_clumsy bag_middle bag_strong bag_weak blocks_demos blocks_random; do
+for source in bag_mix bag_branches bag_climbs bag_lifts bag_between bag_dither bag_clumsy bag_middle bag_strong bag_weak bag_mixed blocks_demos blocks_random; do
   [ -e "$OUT/$source" ] && continue
   .venv/bin/latentsafe collect --source="$source" --dataset.repo_id="latentsafe/$source" --dataset.root="$OUT/$source"
 done
