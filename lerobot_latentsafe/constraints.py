@@ -294,8 +294,7 @@ def cover(failing: np.ndarray, safe: np.ndarray) -> list[tuple[np.ndarray, float
                 "that are labelled as a whole, which tell how far the failure reaches"
             )
         return [(where, 1.0) for where in failing]
-    tried = failing[np.linspace(0, len(failing) - 1, min(len(failing), 100)).astype(int)]
-    reaches = np.geomspace(*REACH, 33)
+    tried, reaches = _centres(failing), np.geomspace(*REACH, 65)
     inside = lambda rows: np.linalg.norm(rows[:, None] - tried, axis=-1)[..., None] <= reaches  # noqa: E731
     caught, wronged = inside(failing[:: -(-len(failing) // 2000)]), inside(safe[:: -(-len(safe) // 2000)])
     chosen: list[tuple[np.ndarray, float]] = []
@@ -303,11 +302,9 @@ def cover(failing: np.ndarray, safe: np.ndarray) -> list[tuple[np.ndarray, float
     has, costs = np.zeros(len(caught), bool), np.zeros(len(wronged), bool)
     while len(chosen) < MOST:
         worth = (caught | has[:, None, None]).mean(0) - (wronged | costs[:, None, None]).mean(0)
-        i = worth.max(1).argmax()
-        equal = np.flatnonzero(worth[i] == worth[i].max())
-        j = equal[len(equal) // 2]  # between the farthest that fails and the nearest that is safe
-        if worth[i, j] <= best + 0.01:
+        if worth.max() <= best + 0.01:
             break
+        i, j = _middle(tried, reaches, worth == worth.max())
         best = worth[i, j]
         has, costs = has | caught[:, i, j], costs | wronged[:, i, j]
         chosen.append((tried[i], float(reaches[j])))
@@ -317,3 +314,19 @@ def cover(failing: np.ndarray, safe: np.ndarray) -> list[tuple[np.ndarray, float
             "train with other numbers: latentsafe train-reachability --alike=..."
         )
     return chosen
+
+
+def _centres(failing: np.ndarray) -> np.ndarray:
+    """Where a prototype may be: at some failing frames, and between them, as recordings may pass a failure by."""
+    rng, at = np.random.default_rng(0), np.linspace(0, len(failing) - 1, min(len(failing), 100)).astype(int)
+    share = rng.dirichlet(np.ones(4), 400)
+    between = share[:, None] @ failing[rng.integers(len(failing), size=share.shape)]
+    return np.concatenate([failing[at], between[:, 0]])
+
+
+def _middle(centres: np.ndarray, reaches: np.ndarray, equal: np.ndarray) -> tuple[int, int]:
+    """Of balls that tell frames apart equally well, bool (centres, reaches), the one most like all of them."""
+    i, j = np.nonzero(equal)
+    away = np.linalg.norm(centres[i] - centres[i].mean(0), axis=-1) + np.abs(reaches[j] - reaches[j].mean())
+    k = away.argmin()
+    return int(i[k]), int(j[k])
