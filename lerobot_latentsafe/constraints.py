@@ -325,8 +325,11 @@ def _centres(failing: np.ndarray) -> np.ndarray:
 
 
 def _middle(centres: np.ndarray, reaches: np.ndarray, equal: np.ndarray) -> tuple[int, int]:
-    """Of balls that tell frames apart equally well, bool (centres, reaches), the one most like all of them."""
+    """Of balls that tell frames apart equally well, bool (centres, reaches), the one most like all of them.
+
+    Of those with its centre it is the one that reaches farthest: what is not known to be safe is forbidden.
+    """
     i, j = np.nonzero(equal)
     away = np.linalg.norm(centres[i] - centres[i].mean(0), axis=-1) + np.abs(reaches[j] - reaches[j].mean())
-    k = away.argmin()
-    return int(i[k]), int(j[k])
+    k = int(i[away.argmin()])
+    return k, int(np.flatnonzero(equal[k])[-1])
