@@ -47,7 +47,7 @@ class Collect:
     - bag_retreats: whole lifts by either end and the middle, lowered slowly or stopped now and then
     - bag_pulls: the same lifts, undisturbed
     - bag_varied, bag_varied_pulls: lifts of bags that are stiffer or softer, heavier or lighter, rougher or smoother
-    - bag_middle, bag_strong, bag_weak, bag_mixed: demonstrations; in the last three the hand is pushed aside now and then
+    - bag_middle, bag_strong, bag_weak, bag_mixed: demonstrations; in the last three the hand is pushed aside at times
     - blocks_demos, blocks_random: the blocks
 
     Sources of the SO-101, which pushes a cube to a mark near the table's edge:
