@@ -17,6 +17,7 @@ def row(lost, first=None, success=False, steps=90):
         "value": [0.5] * steps,
         "margin": [0.6] * steps,
         "intervened": acted,
+        "deviation": [0.5 * on for on in acted],
         "spilled": [0] * (steps - 1) + [lost],
     }
     return {
@@ -31,6 +32,7 @@ def test_summary_counts_what_is_lost_and_overridden():
     assert cell["stall"]["k"] == 0 and runs.summary([row(0), row(1)], n_candies=24)["stall"]["k"] == 1
     assert (cell["spills_below_5_percent"]["k"], cell["spills_below_5_percent"]["n"]) == (1, 2)
     assert cell["mean_share_lost"] == pytest.approx(13 / 72) and cell["overridden_share"] == pytest.approx(40 / 270)
+    assert cell["deviation"] == pytest.approx(0.5 * 40 / 270)
     assert cell["median_first_override"] == 70 and cell["episodes_overridden"] == 2
     assert cell["decision_cpu_ms"]["p99"] == pytest.approx(10)  # the first decisions warm up
 

@@ -96,6 +96,11 @@ def test_policies_are_compared_operators_traced_and_the_demo_tells(script, filte
     kept = table.with_suffix(".jsonl").read_text()
     script("bag_policies", *options)
     assert table.with_suffix(".jsonl").read_text() == kept  # nothing was run again
+    rows = json.loads(table.read_text())
+    script("bag_policies", f"--mixed={base_path}", *options[1:])
+    both = json.loads(table.read_text())
+    assert both["weak"] == rows["weak"] and both["mixed"]["bare"]["spilled"]["n"] == 2 and both["mixed"]["commit"]
+    (tmp_path / "policies_mixed.png").unlink()
 
     for operator in ("closed_end", "open_end"):
         given = ["--laws", "margin", "--operators", operator, "--n=1", f"--output={tmp_path / operator}.json"]

@@ -1,5 +1,6 @@
-"""A weak and a strong diffusion policy lift the bag, bare and under the same filters, from the same starts."""
+"""Diffusion policies lift the bag, bare and under the same filters, from the same starts."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -49,8 +50,10 @@ def compare_policies(
 ) -> None:
     """Run each policy bare and under each filter, and write the table, a picture beside it, and videos.
 
+    Policies that the table held before, and that are not run now, stay in it as they are.
+
     Args:
-        bases: `weak` or `strong` -> path of the policy.
+        bases: `weak`, `strong` or `mixed` -> path of the policy.
         settings: the first one, and its law, are drawn and filmed.
         n: starts.
         output: of the table, .json.
@@ -64,8 +67,11 @@ def compare_policies(
         print(f"{who}, bare: {in_short(laws['bare'])}")
         for setting in settings:
             print(f"{who}, {setting.law} of {setting.path}: {in_short(laws[setting.law][setting.path])}")
-    draw(table, settings[0].law, output.with_suffix(".png"))
-    write_json(output, {**table, "filters": in_use(settings), **made_by})
+    kept = json.loads(output.read_text()) if output.exists() else {}
+    stem = output.stem if {*kept} <= {*bases} else "_".join([output.stem, *bases])
+    draw(table, settings[0].law, output.with_name(f"{stem}.png"))
+    made_by = {"filters": in_use(settings), **made_by}
+    write_json(output, {**made_by, **kept, **{who: {**rows, **made_by} for who, rows in table.items()}})
     for who in bases:
         for seed in range(FIRST_SEED, FIRST_SEED + n_videos):
             bare, shielded = ({**cells[who, setting], "seed": seed} for setting in (None, settings[0]))

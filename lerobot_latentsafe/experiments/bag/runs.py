@@ -162,6 +162,7 @@ def summary(rows: list[dict], n_candies: int) -> dict:
         late = [l > 0 for row in rows for l, spilled in zip(row["margin"][1:], row["spilled"]) if spilled]
         result |= {
             "seen_after_a_spill": {"n": len(late), "called_safe": sum(late)},
+            "deviation": float(np.mean([np.mean(row["deviation"]) for row in rows])),
             "overridden_share": float(np.mean([row["overridden"] / len(row["spilled"]) for row in rows])),
             "episodes_overridden": len(firsts),
             "median_first_override": float(np.median(firsts)) if firsts else None,
