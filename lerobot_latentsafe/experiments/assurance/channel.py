@@ -46,7 +46,7 @@ LAWS = {
 }
 """Those that are compared; all hold the proposal for PROPOSAL_STEPS first."""
 EPSILON = 0.5
-"""Threshold of all laws, chosen on other starts, where the critic's runs hit no wall; the planner's hit most at less."""
+"""Threshold of all laws, chosen on other starts: there the runs of the critic hit no wall."""
 FAR = 0.03
 """Starts are those that the exact controller keeps this far from the walls, m."""
 
