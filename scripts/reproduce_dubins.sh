@@ -1,9 +1,10 @@
 #!/usr/bin/env bash
 # Everything of results/dubins from nothing, resumable: a step whose output exists is skipped.
 #   scripts/reproduce_dubins.sh [OUT]     OUT defaults to outputs/dubins
+# UNTIL=table1 stops after Table 1. RANDOM_EPISODES says how many random drives the filters learn from.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-OUT=${1:-outputs/dubins}
+OUT=${1:-outputs/dubins} UNTIL=${UNTIL:-all} RANDOM_EPISODES=${RANDOM_EPISODES:-2000}
 BIN=.venv/bin
 export HF_HUB_OFFLINE=1 OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
 mkdir -p "$OUT"
@@ -43,9 +44,10 @@ diffusion() { # careful|reckless [more options of lerobot-train]
 }
 
 three='[[-1.25,1.0],[0.0,1.0],[1.25,1.0]]'
-data random 2000
+data random "$RANDOM_EPISODES"
 for seed in 0 1 2; do filter "$seed" random "$seed" "$three"; done
 $BIN/python scripts/dubins_table1.py --filters "$OUT"/filter_{0,1,2} --seeds 0 1 2
+[ "$UNTIL" != table1 ] || exit 0
 
 data random_left_only 2000
 filter left_only random_left_only 0 '[[0.0,1.0],[1.25,1.0]]'
