@@ -3,6 +3,7 @@
 V(z) = min(l(z), max_a Q(z, a)), where Q(z, a) is the value *after* a: Q(z, a) = V(z') for z' = step(z, a).
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -99,6 +100,8 @@ class ReachabilityConfig:
         gamma: the final discount; 1 - gamma is annealed from `gamma_start` geometrically over `anneal` of the run,
             after `warmup` of the run at gamma = 0.
         caution: weight of overestimates of V in the squared error, relative to underestimates.
+        hinge: weight of a one-sided hinge on V, which should be above `HINGE_ABOVE` where recorded episodes went on to
+            succeed, by their column next.success. It keeps the filter from stopping what is known to go well.
         tau: rate of the target network.
         pool: imagined states kept; a part is imagined anew every `refresh` steps.
         greedy: share of imagined trajectories that follow the current fallback policy, which lets imagination visit
@@ -123,6 +126,7 @@ class ReachabilityConfig:
     warmup: float = 0.04
     anneal: float = 0.26
     caution: float = 2.0
+    hinge: float = 0.0
     tau: float = 0.05
     pool: int = 131_072
     refresh: int = 250
@@ -138,8 +142,12 @@ class ReachabilityConfig:
             )
         if self.actor_through not in ("critic", "world_model"):
             raise ValueError(f"actor_through is {self.actor_through!r}; expected critic or world_model")
+        if not 0 <= self.hinge < math.inf:
+            raise ValueError(f"--policy.reachability.hinge is {self.hinge}; expected a weight, 0 or more")
 
 
+HINGE_ABOVE = 0.3
+"""What V should be at least where a recorded episode went on to succeed."""
 LARGEST_Q = 10.0
 """V lies in [-1, 1]; a Q that is larger than this was never learned."""
 

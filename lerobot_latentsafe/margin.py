@@ -21,6 +21,8 @@ class MarginConfig:
         weight: weight of Eq. 3 in the training loss; 0 leaves the margin to `latentsafe train-margin`.
         clips: windows of the data that `latentsafe train-margin` fits the margin to.
         noise: of the features meanwhile, in standard deviations: the more of them, the more.
+        gradient_penalty: weight of the squared gradient of l between failing and safe features, by which
+            `latentsafe train-margin` makes l rise gradually from one to the other.
         failure_specification: name of the failure labels: a dataset column or a sidecar file.
     """
 
@@ -30,6 +32,7 @@ class MarginConfig:
     weight: float = 10.0
     clips: int = 10_000
     noise: float = 0.5
+    gradient_penalty: float = 0.0
     failure_specification: str = "failure"
 
     def __post_init__(self) -> None:
@@ -37,6 +40,10 @@ class MarginConfig:
             raise ValueError(f"--policy.margin.delta is {self.delta}; expected a positive number")
         if not 0 <= self.noise < math.inf:
             raise ValueError(f"--policy.margin.noise is {self.noise}; expected standard deviations, 0 or more")
+        if not 0 <= self.gradient_penalty < math.inf:
+            raise ValueError(
+                f"--policy.margin.gradient_penalty is {self.gradient_penalty}; expected a weight, 0 or more"
+            )
 
 
 class FailureMargin(nn.Module):
@@ -74,3 +81,23 @@ def hinge_loss(margin: Tensor, failure: Tensor, delta: float = 0.75) -> Tensor:
     safe, failing = failure == 0, failure == 1
     n_safe, n_failing = mean_over_ranks(torch.stack([safe.sum(), failing.sum()])).clamp(min=1e-6)
     return (F.relu(delta - margin) * safe).sum() / n_safe + (F.relu(delta + margin) * failing).sum() / n_failing
+
+
+def slope_between(margin: FailureMargin, features: Tensor, failure: Tensor, generator: torch.Generator) -> Tensor:
+    """Mean squared gradient of l at random places between failing and safe features; 0 where there is but one kind.
+
+    The gradient penalty of Gulrajani et al. (2017), without their wish that it be 1: the hinge loss says how far apart
+    both ends are.
+
+    Args:
+        features: (N, D).
+        failure: (N,), 1 of those that fail, 0 of safe ones.
+    """
+    failing, safe = features[failure == 1], features[failure == 0]
+    if not len(failing) or not len(safe):
+        return features.new_zeros(())
+    share = torch.rand(len(safe), 1, generator=generator).to(features.device)
+    other = failing[torch.randint(len(failing), (len(safe),), generator=generator).to(features.device)]
+    between = torch.lerp(other, safe, share).detach().requires_grad_()
+    (slope,) = torch.autograd.grad(margin(between).sum(), between, create_graph=True)
+    return slope.square().sum(-1).mean()

@@ -14,7 +14,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from lerobot_latentsafe.critic import ReachabilityConfig, SafetyCritic, safety_bellman_target
+from lerobot_latentsafe.critic import HINGE_ABOVE, ReachabilityConfig, SafetyCritic, safety_bellman_target
 from lerobot_latentsafe.latent import Latent, map_latent, replace_rows, select
 from lerobot_latentsafe.runtime.distributed import any_rank, from_first_rank, gathered, share, sum_over_ranks
 
@@ -107,12 +107,16 @@ class LatentReachability:
 
     Several ranks learn what one learns: they make the same draws, of which each imagines and backs up its share. What
     they imagine is gathered in the pool of each, and gradients are summed.
+
+    Args:
+        succeeding: (M, D), features of latents from which a recorded episode went on to succeed, for the hinge.
     """
 
     def __init__(
         self, imagination: Imagination, critic: SafetyCritic, starts: Starts, config: ReachabilityConfig,
-        generator: torch.Generator | None = None,
+        generator: torch.Generator | None = None, succeeding: Tensor | None = None,
     ):  # fmt: skip
+        self.succeeding = succeeding
         self.imagination, self.critic, self.starts, self.config = imagination, critic, starts, config
         self.generator = generator
         self.target = copy.deepcopy(critic).requires_grad_(False)
@@ -257,6 +261,8 @@ class LatentReachability:
         target = self._td_target(batch, gamma)
         critic_loss = self._cautious_loss(self._predict(batch) - target)
         loss = critic_loss
+        if self.succeeding is not None:
+            loss = loss + config.hinge * self._hinge(self.succeeding)
         if self.critic.actor is not None:
             through_model = config.actor_through == "world_model"
             loss = loss - (self._imagined_value() if through_model else self._actor_objective(batch["x"]))
@@ -277,6 +283,13 @@ class LatentReachability:
     def _cautious_loss(self, error: Tensor) -> Tensor:
         """Squared error in which an overestimate, a danger missed, weighs `caution` times an underestimate."""
         return (torch.where(error > 0, self.config.caution, 1.0) * error.square()).mean()
+
+    def _hinge(self, succeeding: Tensor) -> Tensor:
+        """Mean square of what V lacks where recorded episodes went on to succeed; the actor is not changed by it."""
+        picked = self._draw(torch.randint, len(succeeding), (self.config.batch_size,))
+        x, critic = self.critic.project(succeeding[picked]), self.critic
+        best = critic.best_q(x) if critic.discrete else critic.q_of(x, critic.act(x).detach())
+        return torch.relu(HINGE_ABOVE - best).square().mean()
 
     def _predict(self, batch: dict[str, Tensor]) -> Tensor:
         if self.critic.discrete:

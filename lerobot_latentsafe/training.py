@@ -25,8 +25,9 @@ from lerobot_latentsafe.critic import BACKUPS
 from lerobot_latentsafe.datasets.adoption import adopt_dataset
 from lerobot_latentsafe.datasets.clips import ClipReader, FilterData
 from lerobot_latentsafe.datasets.fingerprints import episode_marks, with_episodes
+from lerobot_latentsafe.datasets.labels import read_frames
 from lerobot_latentsafe.latent import Latent, map_latent, select
-from lerobot_latentsafe.margin import FailureMargin, hinge_loss
+from lerobot_latentsafe.margin import FailureMargin, MarginConfig, hinge_loss, slope_between
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
 from lerobot_latentsafe.reachability import LatentReachability, Starts
 from lerobot_latentsafe.runtime.checkpoint import read_config, weights_digest
@@ -77,8 +78,8 @@ def seen_and_imagined(
 
 
 def fit_margin(
-    margin: FailureMargin, features: Tensor, failure: Tensor, delta: float, generator: torch.Generator,
-    steps: int = 1500, noise: float = 0.5,
+    margin: FailureMargin, features: Tensor, failure: Tensor, config: MarginConfig, generator: torch.Generator,
+    steps: int = 1500,
 ) -> None:  # fmt: skip
     """Fit a margin (Eq. 3) to fixed features, regularised: trained along with a world model it overfits.
 
@@ -86,7 +87,8 @@ def fit_margin(
     which bounds it for the backup, still tells a sure margin from a surer one.
 
     Args:
-        noise: standard deviation of Gaussian noise on the features, which are scaled to unit deviation meanwhile.
+        config: delta of Eq. 3, and what the fit is regularised by: noise on the features, which are scaled to unit
+            deviation meanwhile, and a gradient penalty.
     """
     mean, std = features.mean(0), features.std(0).clamp(min=1e-3)
     layers = [layer for layer in margin.net if isinstance(layer, nn.Linear)]
@@ -97,8 +99,10 @@ def fit_margin(
             group["lr"] = 1e-3 * min(1.0, 2 - 2 * step / steps)
         picked = torch.randint(len(features), (512,), generator=generator, device="cpu").to(features.device)
         x = (features[picked] - mean) / std
-        x = x + noise * torch.randn(x.shape, generator=generator).to(x.device)
-        loss = hinge_loss(margin(x), failure[picked], delta)
+        x = x + config.noise * torch.randn(x.shape, generator=generator).to(x.device)
+        loss = hinge_loss(margin(x), failure[picked], config.delta)
+        if config.gradient_penalty:
+            loss = loss + config.gradient_penalty * slope_between(margin, x, failure[picked], generator)
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()
@@ -135,7 +139,7 @@ def train_margin(path: str | Path, dataset_meta, output_dir: Path, seed: int = 0
         model, config, started = policy.model, policy.config, time.process_time()
         features, failure = seen_and_imagined(model, reader, config.margin.clips, generator)
         model.margin = model.new_margin()
-        fit_margin(model.margin, features, failure, config.margin.delta, generator, noise=config.margin.noise)
+        fit_margin(model.margin, features, failure, config.margin, generator)
         config.change(trained_on=replace(trained_on_too(policy, reader), stage="world_model"), frame_cache=None)
         _save(policy, model.margin, folder, run)
     print(f"margin: {time.process_time() - started:.0f} CPU-s")
@@ -258,6 +262,12 @@ def train_reachability(
     if alike and target == "risk":
         raise ConstraintError("--alike and --target=risk: a risk is that of one failure; give one of them")
     policy, reader = load_with_cache(path, dataset_meta, seed)
+    hinge = policy.config.reachability.hinge
+    if hinge and (alike or target == "risk"):
+        raise ValueError(
+            f"--policy.reachability.hinge is {hinge:g}, which speaks of the safety value of one failure; leave out "
+            "--alike and --target=risk, or set it to 0"
+        )
     options = {"alike": alike} if alike else {}
     run = _run(policy, reader, "reachability", seed=seed, steps=steps, target=target, **options)
     before = _trained_before(Path(output_dir), run)
@@ -267,7 +277,8 @@ def train_reachability(
         started = time.process_time()
         numbers = numbers_named(dataset_meta, [*alike]) if alike else None
         likeness = LikenessConfig(alike or {}, own=policy.config.margin.failure_specification)
-        learn_critic(policy, reader, seed, steps, target, likeness, numbers)
+        succeeds = frames_of_success(dataset_meta.root, reader) if hinge else None
+        learn_critic(policy, reader, seed, steps, target, likeness, numbers, succeeds)
         if rank() == 0:
             _save(policy, policy.model.critic, folder, run)
             print(f"reachability: {time.process_time() - started:.0f} CPU-s")
@@ -276,11 +287,12 @@ def train_reachability(
 
 def learn_critic(
     policy: LatentSafePolicy, reader: ClipReader, seed: int, steps: int | None, target: str = "reachability",
-    likeness: LikenessConfig | None = None, numbers: np.ndarray | None = None,
+    likeness: LikenessConfig | None = None, numbers: np.ndarray | None = None, succeeds: np.ndarray | None = None,
 ) -> None:  # fmt: skip
     """Give a filter a trained critic.
 
     Args:
+        succeeds: bool (N,), the frames of episodes that succeed, for the hinge.
         likeness, numbers: of a critic that takes constraints, and (N, m - 1) of all frames; see `learn_likeness`.
     """
     model = policy.model
@@ -298,7 +310,13 @@ def learn_critic(
         likeness, places = learn_likeness(model.likeness, likeness, numbers, features, frame, generator)
         known = likeness.own_failure
         starts = with_random_sets(starts, places, generator)
-    learner = LatentReachability(model.imagination, model.critic, starts, model.config.reachability)
+    succeeding = None
+    if succeeds is not None:
+        features, frame = seen_and_imagined(model, numbered(reader), model.config.margin.clips, generator)
+        succeeding = features[torch.from_numpy(succeeds)[frame]]
+    learner = LatentReachability(
+        model.imagination, model.critic, starts, model.config.reachability, succeeding=succeeding
+    )
     progress = trange(model.config.reachability.steps, desc="reachability", unit="step", disable=rank() > 0)
     for step in progress:
         metrics = learner.update()
@@ -310,6 +328,24 @@ def learn_critic(
         constraints=[*known],
     )
     model.critic.eval()
+
+
+def frames_of_success(root: Path, reader: ClipReader) -> np.ndarray:
+    """The frames of episodes that end in success, by next.success, and never fail: bool (N,).
+
+    Raises:
+        ValueError: the dataset does not tell, or no episode does.
+    """
+    column, labels = read_frames(root, ["next.success"]).get("next.success"), reader.labels
+    remedy = "record with an environment or a page that tells, or set --policy.reachability.hinge=0"
+    if column is None:
+        raise ValueError(f"{root} has no column next.success, which the hinge needs; {remedy}")
+    _, of, counts = np.unique(labels.episode, return_inverse=True, return_counts=True)
+    success = np.asarray(column).reshape(-1).astype(bool)[np.cumsum(counts) - 1]
+    clean = np.bincount(of, labels.failure != 0) == 0
+    if not (success & clean).any():
+        raise ValueError(f"no episode of {root} ends in success without a failure, which the hinge needs; {remedy}")
+    return (success & clean)[of]
 
 
 def _aim_at(model: SafetyModel, reader: ClipReader, target: str, steps: int | None, likeness: LikenessConfig) -> None:

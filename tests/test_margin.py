@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from lerobot_latentsafe.margin import FailureMargin, MarginConfig, hinge_loss
+from lerobot_latentsafe.margin import FailureMargin, MarginConfig, hinge_loss, slope_between
 
 
 def test_hinge_loss_by_hand():
@@ -73,7 +73,7 @@ def test_fitted_margin_separates_and_tanh_still_resolves_it():
     features = torch.randn(2000, 6) * torch.tensor([100.0, 1, 1, 1, 1, 1e-2]) + 5
     failure = (features[:, 0] < 5).long()
     margin = FailureMargin(6, hidden=16, n_layers=1)
-    fit_margin(margin, features, failure, 0.75, generator, steps=300)
+    fit_margin(margin, features, failure, MarginConfig(), generator, steps=300)
     with torch.no_grad():
         l = margin(features)
     assert ((l < 0) == (failure == 1)).float().mean() > 0.95
@@ -84,3 +84,37 @@ def test_fitted_margin_separates_and_tanh_still_resolves_it():
 def test_noise_that_is_none_is_refused(noise):
     with pytest.raises(ValueError, match=r"--policy.margin.noise is .*standard deviations, 0 or more"):
         MarginConfig(noise=noise)
+
+
+def test_the_slope_of_a_linear_margin_is_that_of_its_weights():
+    features, failure = torch.randn(40, 3, generator=torch.Generator().manual_seed(0)), torch.arange(40) % 2
+    margin = torch.nn.Sequential(torch.nn.Linear(3, 1), torch.nn.Flatten(0))
+    slope = slope_between(margin, features, failure, torch.Generator().manual_seed(0))
+    assert slope.item() == pytest.approx(margin[0].weight.square().sum().item(), rel=1e-5)
+
+
+def test_a_margin_with_a_gradient_penalty_is_another_and_separates():
+    from lerobot_latentsafe.training import fit_margin
+
+    heap = torch.randn(2000, 4, generator=torch.Generator().manual_seed(1)) * 0.2
+    failure = (torch.arange(2000) % 2).long()
+    features, found = heap + torch.tensor([1.0, 0, 0, 0]) * (1 - failure[:, None]), []
+    for penalty in (0.0, 1.0):
+        torch.manual_seed(0)
+        margin, generator = FailureMargin(4), torch.Generator().manual_seed(0)
+        fit_margin(margin, features, failure, MarginConfig(noise=0.0, gradient_penalty=penalty), generator, steps=300)
+        found.append(margin(features).detach())
+        assert ((found[-1] < 0) == failure.bool()).float().mean() > 0.95
+    assert not torch.allclose(*found, atol=1e-2)
+
+
+def test_features_of_one_kind_have_no_slope_between_them():
+    generator = torch.Generator().manual_seed(0)
+    for failure in (torch.zeros(5), torch.ones(5)):
+        assert slope_between(FailureMargin(3), torch.randn(5, 3), failure, generator).item() == 0
+
+
+@pytest.mark.parametrize("penalty", [-0.1, float("inf"), float("nan")])
+def test_a_penalty_that_is_none_is_refused(penalty):
+    with pytest.raises(ValueError, match=r"--policy.margin.gradient_penalty is .*a weight, 0 or more"):
+        MarginConfig(gradient_penalty=penalty)

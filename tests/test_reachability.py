@@ -7,7 +7,7 @@ import pytest
 import tiny
 import torch
 
-from lerobot_latentsafe.critic import ReachabilityConfig, SafetyCritic, safety_bellman_target
+from lerobot_latentsafe.critic import HINGE_ABOVE, ReachabilityConfig, SafetyCritic, safety_bellman_target
 from lerobot_latentsafe.dubins import car
 from lerobot_latentsafe.dubins.ground_truth import exact_value
 from lerobot_latentsafe.evaluation.statistics import confusion
@@ -152,6 +152,33 @@ def test_equal_seeds_learn_equal_critics(candidates):
     first, second = (small_learner(WindyChain(), candidates, seed=3) for _ in range(2))
     for _ in range(15):
         assert first.update() == second.update()
+
+
+@pytest.mark.parametrize("candidates", [torch.tensor([[-1.0], [1.0]]), None], ids=["discrete", "continuous"])
+def test_where_recordings_succeed_a_hinge_raises_v_and_lowers_none(candidates):
+    lacks = []
+    for hinge in (0.0, 10.0):
+        learner = small_learner(WindyChain(), candidates, hinge=hinge)
+        learner.succeeding = torch.tensor([[0.2], [0.3]])  # which the wind blows into failure
+        for _ in range(60):
+            learner.update()
+        lacks.append(learner._hinge(learner.succeeding).item())
+    assert lacks[1] < 0.5 * lacks[0]
+    learner.optimizer.zero_grad()
+    with torch.no_grad():
+        learner.critic.q[-1].bias.fill_(-5.0)
+    learner._hinge(learner.succeeding).backward()
+    assert (learner.critic.q[-1].bias.grad <= 0).all()  # a step of descent raises V
+    assert learner.critic.actor is None or all(p.grad is None for p in learner.critic.actor.parameters())
+    with torch.no_grad():
+        learner.critic.q[-1].bias.fill_(HINGE_ABOVE + 5)
+    assert learner._hinge(learner.succeeding).item() == 0
+
+
+@pytest.mark.parametrize("hinge", [-1.0, float("inf"), float("nan")])
+def test_a_hinge_that_is_none_is_refused(hinge):
+    with pytest.raises(ValueError, match=r"--policy.reachability.hinge is .*a weight, 0 or more"):
+        ReachabilityConfig(hinge=hinge)
 
 
 def test_q_is_the_value_after_the_action():

@@ -1,7 +1,9 @@
 """Training on a frozen world model: killed, started twice, by two at once, with options that mean nothing."""
 
 import shutil
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import tiny
 import torch
@@ -125,6 +127,45 @@ def test_a_configuration_without_steps_makes_no_critic(tiny_world_model, cache_m
     with pytest.raises(ValueError, match=r"reachability\.steps is 0"):
         train_reachability(folder, cache_meta, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+@pytest.fixture
+def hinged(tiny_world_model, tmp_path):
+    """A filter after stage 1, whose critic is to heed what succeeds."""
+    folder = shutil.copytree(tiny_world_model, tmp_path / "model")
+    tiny.rewrite_group(folder, "reachability", hinge=1.0)
+    return folder
+
+
+def test_a_hinge_needs_recordings_that_tell_what_succeeds(hinged, cache_meta, tmp_path):
+    with pytest.raises(ValueError, match=r"has no column next\.success, which the hinge needs; record with"):
+        train_reachability(hinged, cache_meta, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("other", [{"target": "risk"}, {"alike": {"heading_cos.pos": 1.0}}])
+def test_a_hinge_speaks_of_the_value_of_one_failure(hinged, cache_meta, tmp_path, other):
+    with pytest.raises(ValueError, match=r"--policy\.reachability\.hinge is 1, .*--alike and --target=risk"):
+        train_reachability(hinged, cache_meta, tmp_path / "out", **other)
+
+
+def test_episodes_that_succeed_end_so_and_never_fail(monkeypatch):
+    reader = SimpleNamespace(
+        labels=SimpleNamespace(episode=np.repeat([0, 3, 4, 7], 3), failure=np.array([0] * 3 + [0, 1, 0] + [0] * 6))
+    )
+    success = np.array([0, 0, 1, 0, 0, 1, 1, 1, 0, 0, 1, 1], bool)
+    monkeypatch.setattr(training, "read_frames", lambda root, columns: {"next.success": success[:, None]})
+    assert training.frames_of_success("root", reader).tolist() == [True] * 3 + [False] * 6 + [True] * 3
+    success[[2, 11]] = False
+    with pytest.raises(ValueError, match="no episode of root ends in success without a failure"):
+        training.frames_of_success("root", reader)
+
+
+def test_a_critic_with_a_hinge_is_trained(hinged, cache_meta, tmp_path, monkeypatch):
+    everything = lambda root, reader: np.ones(len(reader.labels.episode), bool)  # noqa: E731
+    monkeypatch.setattr(training, "frames_of_success", everything)
+    policy = train_reachability(hinged, cache_meta, tmp_path / "out")
+    assert policy.config.reachability.hinge == 1.0 and policy.config.trained_on.stage == "critic"
 
 
 NOWHERE = {"policy": PolicySource("no/such"), "output_dir": "out"}

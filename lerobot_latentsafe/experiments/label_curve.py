@@ -68,7 +68,7 @@ class Study:
         margin = FailureMargin(self.seen.shape[1], self.config.hidden, self.config.layers)
         known = np.isin(self.episode, labelled)[self.frame]
         features, failure = map(torch.from_numpy, (self.features[known], self.failure[self.frame[known]]))
-        fit_margin(margin, features, failure, self.config.delta, generator, noise=self.config.noise)
+        fit_margin(margin, features, failure, self.config, generator)
         with torch.no_grad():
             return margin.bounded(torch.from_numpy(self.seen)).numpy()
 

@@ -165,7 +165,7 @@ def dedicated(path: str, meta, case: Case, seed: int, steps: int, folder: Path) 
     config, generator = policy.config, torch.Generator().manual_seed(seed)
     features, failure = seen_and_imagined(policy.model, reader, config.margin.clips, generator)
     policy.model.margin = policy.model.new_margin()
-    fit_margin(policy.model.margin, features, failure, config.margin.delta, generator, noise=config.margin.noise)
+    fit_margin(policy.model.margin, features, failure, config.margin, generator)
     learn_critic(policy, reader, seed, steps)
     save_policy(policy, folder)
 
