@@ -83,7 +83,7 @@ def run(job: dict) -> dict:
     torch.set_num_threads(1)
     study, setting = STUDIES[job["study"]], FilterSetting.from_job(job["filter"])
     if study.env is None:
-        return {"episodes": [_lifted(operators.run({**job, "operator": study.drivers[job["driver"]]}))]}
+        return {"episodes": [outcome(operators.run({**job, "operator": study.drivers[job["driver"]]}))]}
     policy = operators.load(setting, study.drivers[job["driver"]])
     runs = run_episodes(policy, study.env(), job["n"], job["seed"])
     rows: list[dict] = [{name: bool(getattr(runs, name)[i]) for name in OUTCOMES} for i in range(job["n"])]
@@ -97,8 +97,8 @@ def run(job: dict) -> dict:
     return {"episodes": rows}
 
 
-def _lifted(row: dict) -> dict:
-    """An operator's episode of the bag."""
+def outcome(row: dict) -> dict:
+    """An episode of the bag, see `drive`: what became of it, and what was changed."""
     spilled, success = row["lost"] > 0, bool(row["success"])
     outcome = {"violation": spilled, "success": success and not spilled, "stall": not (success or spilled)}
     return {**outcome, "changed": row["intervened"], "adjusted": row["adjusted"], "deviation": row["deviation"]}
