@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
 # Everything of results/dubins from nothing, resumable: a step whose output exists is skipped.
 #   scripts/reproduce_dubins.sh [OUT]     OUT defaults to outputs/dubins
-# UNTIL=table1 stops after Table 1. RANDOM_EPISODES says how many random drives the filters learn from.
+# UNTIL=table1 stops after Table 1. RANDOM_EPISODES says how many random drives its filters learn from: 2000 in the paper.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-OUT=${1:-outputs/dubins} UNTIL=${UNTIL:-all} RANDOM_EPISODES=${RANDOM_EPISODES:-2000}
+OUT=${1:-outputs/dubins} UNTIL=${UNTIL:-all} RANDOM_EPISODES=${RANDOM_EPISODES:-1000}
 BIN=.venv/bin
 export HF_HUB_OFFLINE=1 OMP_NUM_THREADS=${OMP_NUM_THREADS:-1}
 mkdir -p "$OUT"
