@@ -1,0 +1,70 @@
+"""The study of a new constraint on the bag: the zone, what is marked, one short run, and the table."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from lerobot_latentsafe.constraints import LikenessConfig
+from lerobot_latentsafe.experiments.assurance import bag_constraint as study_module
+from lerobot_latentsafe.experiments.assurance.bag_constraint import CASES, LINE, NUMBER, inside, mark, run, study
+from lerobot_latentsafe.franka.actions import STATE_NAMES
+
+
+def states(x):
+    found = np.zeros((len(x), len(STATE_NAMES)), np.float32)
+    found[:, STATE_NAMES.index(NUMBER)] = x
+    return found
+
+
+def test_the_zone_is_near_the_foot():
+    assert inside(states([LINE - 0.01, LINE + 0.01])).tolist() == [True, False]
+
+
+def test_what_is_marked_lies_in_the_zone(monkeypatch, tmp_path):
+    """Of recordings that begin in the zone, or hardly enter it, nothing is marked."""
+    paths = [
+        np.linspace(0.5, 0.3, 20),
+        np.linspace(0.3, 0.5, 20),
+        np.linspace(0.5, 0.399, 20),
+        np.linspace(0.48, 0.35, 20),
+    ]
+    whole, episode = states(np.concatenate(paths)), np.repeat(np.arange(4), 20)
+    columns = {"observation.state": whole, "episode_index": episode}
+    monkeypatch.setattr(study_module, "load_metadata", lambda name, root: None)
+    monkeypatch.setattr(study_module, "DatasetFrames", lambda meta: SimpleNamespace(episodes=[0, 1, 2, 3]))
+    monkeypatch.setattr(study_module, "read_frames", lambda root, names: columns)
+
+    def encoded(model, frames, some):
+        return torch.from_numpy(np.stack([states(paths[i]) for i in some])), [20] * len(some)
+
+    monkeypatch.setattr(study_module, "encode_episodes", encoded)
+    model = SimpleNamespace(
+        world_model=SimpleNamespace(features=lambda latents: latents),
+        likeness=lambda features: features[..., [STATE_NAMES.index(NUMBER)]] / 0.05,
+    )
+    policy = SimpleNamespace(model=model, config=SimpleNamespace(likeness=LikenessConfig({NUMBER: 0.05})))
+    (prototype,) = mark(policy, tmp_path)["zone"]
+    where, reach = prototype[NUMBER]
+    assert where + reach == pytest.approx(LINE, abs=0.02) and where - reach < 0.35
+
+
+def test_a_bare_run_tells_what_became_of_it(monkeypatch):
+    monkeypatch.setattr(study_module, "STEPS", 2)
+    ran = run({"constraints": None, "seed": 0})
+    assert ran == {"entered": False, "lost": 0, "success": False, "changed": 0}
+
+
+def test_the_table_has_all_cases(monkeypatch, tmp_path):
+    loaded = SimpleNamespace(config=SimpleNamespace(law=SimpleNamespace(name="reachability")))
+    monkeypatch.setattr(study_module, "load_filter", lambda path: loaded)
+    monkeypatch.setattr(study_module, "mark", lambda policy, root: {"zone": []})
+    row = {"entered": True, "lost": 1, "success": False, "changed": 9}
+    monkeypatch.setattr(study_module, "run", lambda job: row)
+    output = tmp_path / "constraints_bag.json"
+    study("filter", tmp_path, 2, output)
+    summary = json.loads(output.read_text())["summary"]
+    assert {*summary} == {*CASES} and summary["bare"]["entered"]["k"] == 2
+    assert summary["with the zone"]["changed_share"] == pytest.approx(0.1)
