@@ -21,6 +21,9 @@ LONG_AGO_MS = 1000.0
 """What was seen so long ago says nothing of a robot that moves."""
 RECENT = 10
 """Steps whose overrides count for `retreat_after`."""
+ADJUSTED_AT_MOST = 3
+"""Of these steps, by the law `nearest` where a retreat is known: V is the same for waiting at a doubtful place as for
+leaving it, so whoever only ever takes the nearest action that passes stays there."""
 
 
 class Reason(IntEnum):
@@ -311,10 +314,12 @@ class Overrides:
     Attributes:
         recent: bool (B, RECENT), whether the fallback acted, the latest last.
         retreated: int64 (B,), steps of a retreat that goes on.
+        adjusted: bool (B, RECENT), whether the nearest action that passes was taken, the latest last.
     """
 
     def __init__(self, n: int):
         self.recent, self.retreated = np.zeros((n, RECENT), bool), np.zeros(n, np.int64)
+        self.adjusted = np.zeros((n, RECENT), bool)
 
     def threshold(self, law: LawConfig) -> np.ndarray:
         """What V must exceed (B,): epsilon, and `resume_above` where the fallback acts. Infinite for the first
@@ -327,10 +332,16 @@ class Overrides:
         tried = self.recent.sum(1) >= law.retreat_after
         return (self.retreated > 0) | tried if law.retreat else np.zeros_like(tried)
 
-    def after(self, acts: np.ndarray, retreats: np.ndarray) -> "Overrides":
-        """One step on: whether the fallback acted, and whether that was the retreat's, bool (B,)."""
+    def may_adjust(self, law: LawConfig) -> np.ndarray:
+        """Whether the nearest action that passes may be taken, or it was often enough that the retreat is due: (B,)."""
+        return ~((self.adjusted.sum(1) >= ADJUSTED_AT_MOST) & bool(law.retreat))
+
+    def after(self, acts: np.ndarray, retreats: np.ndarray, adjusted: np.ndarray) -> "Overrides":
+        """One step on: whether the fallback acted, whether that was the retreat's, and whether the nearest action that
+        passes was taken, bool (B,) each."""
         new = Overrides(len(acts))
         new.recent[:, :-1], new.recent[:, -1] = self.recent[:, 1:], acts
+        new.adjusted[:, :-1], new.adjusted[:, -1] = self.adjusted[:, 1:], adjusted
         new.retreated = (self.retreated + 1) * (acts & retreats)
         return new
 

@@ -385,7 +385,7 @@ class Shield:
             return found
         threshold = self.overrides.threshold(law)
         unsafe = (faults == Reason.PASSED) & np.isfinite(value) & ~(value > threshold) & np.isfinite(threshold)
-        rows = np.flatnonzero(unsafe)
+        rows = np.flatnonzero(unsafe & self.overrides.may_adjust(law))
         if not len(rows):
             return found
         accepted = found.candidate if self._accepted is None else self._accepted
@@ -417,8 +417,9 @@ class Shield:
         return adjusting(decision, judgement.nearest.action)
 
     def _remember(self, judgement: Judgement, decision: FilterDecision, observation: dict[str, Any]) -> None:
-        self.overrides = self.overrides.after(decision.falls_back.numpy(), judgement.retreats)
-        self._accepted = np.where(decision.adjusted.numpy(), judgement.nearest.candidate, -1)
+        adjusted = decision.adjusted.numpy()
+        self.overrides = self.overrides.after(decision.falls_back.numpy(), judgement.retreats, adjusted)
+        self._accepted = np.where(adjusted, judgement.nearest.candidate, -1)
         self.beliefs.append(judgement.belief)  # in place of the one that it grew out of
         self.foretold.append(judgement.foretold)
         blind = np.isin(decision.reason.numpy(), UNSEEN)

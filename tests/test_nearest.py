@@ -223,6 +223,15 @@ def test_during_a_retreat_nothing_is_adjusted(arm, safer_when_slower):
     assert acted == [True, True, False]
 
 
+@pytest.mark.parametrize(("retreat", "adjusts"), [({}, [True] * 6), ({"lift.pos": -1.0}, [True] * 3 + [False] * 3)])
+def test_where_a_retreat_is_known_it_comes_after_a_few_adjusted_steps(arm, safer_when_slower, retreat, adjusts):
+    law = arm.config.law
+    law.epsilon, law.retreat, law.min_retreat_steps = 0.2, retreat, 3
+    decisions = [arm.shield(seen(t=t), POSE + AHEAD) for t in range(6)]
+    assert [decision.adjusted.item() for decision in decisions] == adjusts
+    assert all(decision.intervened.item() for decision in decisions)
+
+
 def test_what_is_verified_is_a_lower_bound_of_v(policy):
     law = policy.config.law
     law.epsilon, law.lookahead, law.proposal_steps = -1.0, 4, 2
