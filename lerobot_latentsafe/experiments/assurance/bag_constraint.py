@@ -24,8 +24,8 @@ from lerobot_latentsafe.franka.actions import STATE_NAMES
 from lerobot_latentsafe.franka.behaviors import begin
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
 
-NUMBER, LINE = "ee_x.pos", 0.40
-"""The zone is where the hand is nearer to the arm's foot than this, m."""
+NUMBER, LINE = "ee_x.pos", 0.56
+"""The zone is where the hand is farther from the arm's foot than this, m."""
 OPERATOR = "side_to_side_0.04"
 N_MARKED = 3
 FIRST_SEED = 340_000
@@ -36,7 +36,7 @@ CASES = {"bare": None, "as it was": ["failure"], "with the zone": ["failure", "z
 
 def inside(state: np.ndarray) -> np.ndarray:
     """Whether the hand is in the zone, of states (..., S): bool (...)."""
-    return state[..., STATE_NAMES.index(NUMBER)] < LINE
+    return state[..., STATE_NAMES.index(NUMBER)] > LINE
 
 
 def mark(policy: LatentSafePolicy, root: Path) -> dict:
