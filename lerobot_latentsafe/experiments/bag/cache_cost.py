@@ -141,6 +141,8 @@ def many(cache: Path, folder: Path, most: int) -> Iterator[tuple[int, Path]]:
 
 def measure_memory(options: CacheCost) -> dict:
     """Of training on these."""
+    if options.scratch is not None:
+        options.scratch.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=options.scratch) as folder:
         found = {}
         for n, root in many(options.cache, Path(folder), options.most):
