@@ -126,6 +126,7 @@ def test_a_robot_behind_an_old_filter_is_refused(verb, tmp_path):
 
 
 SINCE_0_3_OF_THE_LAW = [("law", name) for name in ("slack_ms", "unknown", "kappa", "replan_above", "engine")]
+SINCE_0_3_OF_TRAINING = [("margin", "noise"), ("margin", "gradient_penalty"), ("reachability", "hinge")]
 
 
 def assert_same(first, second, n_steps=6):
@@ -133,7 +134,7 @@ def assert_same(first, second, n_steps=6):
     configs = [json.loads((folder / "config.json").read_text()) for folder in (first, second)]
     for config in configs:
         assert config["reachability"].pop("kept", None) is None
-        for group, name in (*SINCE_0_3_OF_THE_LAW, ("margin", "noise")):
+        for group, name in (*SINCE_0_3_OF_THE_LAW, *SINCE_0_3_OF_TRAINING):
             config[group].pop(name, None)
         for name in SINCE_0_3:
             config["trained_on"].pop(name, None)
