@@ -114,6 +114,13 @@ def fit_margin(
         last.bias.div_(size)
 
 
+def fit_new_margin(model: SafetyModel, reader: ClipReader, generator: torch.Generator) -> None:
+    """Give a model a fresh margin, fitted to what its frozen world model sees and imagines of recordings."""
+    features, failure = seen_and_imagined(model, reader, model.config.margin.clips, generator)
+    model.margin = model.new_margin()
+    fit_margin(model.margin, features, failure, model.config.margin, generator)
+
+
 def train_margin(path: str | Path, dataset_meta, output_dir: Path, seed: int = 0) -> LatentSafePolicy:
     """Load a world model, fit a fresh failure margin to its frozen features, save both.
 
@@ -137,9 +144,7 @@ def train_margin(path: str | Path, dataset_meta, output_dir: Path, seed: int = 0
     with replacing_folder(output_dir) as folder:
         generator = torch.Generator().manual_seed(seed)
         model, config, started = policy.model, policy.config, time.process_time()
-        features, failure = seen_and_imagined(model, reader, config.margin.clips, generator)
-        model.margin = model.new_margin()
-        fit_margin(model.margin, features, failure, config.margin, generator)
+        fit_new_margin(model, reader, generator)
         config.change(trained_on=replace(trained_on_too(policy, reader), stage="world_model"), frame_cache=None)
         _save(policy, model.margin, folder, run)
     print(f"margin: {time.process_time() - started:.0f} CPU-s")

@@ -2,6 +2,7 @@
 """Diffusion policies lift the bag, bare and under the same filters, from the same starts.
 
     scripts/bag_policies.py --weak=bag_diffusion_weak --strong=bag_diffusion_strong --filters <filter> ... --n=100
+    scripts/bag_policies.py --mixed=outputs/bag/diffusion_mixed --filters bag --laws reachability nearest --n=40
 
 Writes results/bag/policies.json: for each policy bare, under each filter, and under the laws that the first filter is
 compared with, runs that spill, candies lost, success, steps overridden, step of the first override, CPU time of a

@@ -55,7 +55,7 @@ def test_a_bare_run_tells_what_became_of_it(monkeypatch):
 
 def test_the_table_has_all_cases(monkeypatch, tmp_path):
     loaded = SimpleNamespace(config=SimpleNamespace(law=SimpleNamespace(name="reachability")))
-    monkeypatch.setattr(study_module, "load_filter", lambda path: loaded)
+    monkeypatch.setattr(study_module, "loaded", lambda path: loaded)
     monkeypatch.setattr(study_module, "mark", lambda policy, root: {"zone": []})
     row = {"entered": True, "lost": 1, "success": False, "changed": 9}
     monkeypatch.setattr(study_module, "run", lambda job: row)

@@ -5,6 +5,7 @@ the filter as it was, and under the filter with the constraint, from the same st
 """
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,6 @@ import torch
 from lerobot_latentsafe.datasets.episodes import DatasetFrames
 from lerobot_latentsafe.datasets.folder import load_metadata
 from lerobot_latentsafe.datasets.labels import read_frames
-from lerobot_latentsafe.decision import LawOptions
 from lerobot_latentsafe.evaluation.along_episodes import encode_episodes
 from lerobot_latentsafe.evaluation.rollouts import steps
 from lerobot_latentsafe.evaluation.statistics import provenance, run_resumable, wilson, write_json
@@ -58,6 +58,12 @@ def mark(policy: LatentSafePolicy, root: Path) -> dict:
     return {"zone": policy.config.likeness.prototypes(places[fails], places[~fails], [NUMBER])}
 
 
+@cache
+def loaded(path: str) -> LatentSafePolicy:
+    """The filter of this process."""
+    return load_filter(path)
+
+
 def run(job: dict) -> dict:
     """One episode: whether the hand enters the zone, whether candies fall, success, and steps changed."""
     torch.set_num_threads(1)
@@ -65,7 +71,7 @@ def run(job: dict) -> dict:
     scene.reset(job["seed"])
     operator, policy = begin(behavior, scene, speed, np.random.default_rng([0, job["seed"]])), None
     if job["constraints"]:
-        policy = load_filter(job["filter"], law=LawOptions(name=job["law"]))
+        policy = loaded(job["filter"])
         likeness = policy.config.likeness
         policy.config.change(
             likeness=replace(likeness, known={**likeness.own_failure, **job["zone"]}), constraints=job["constraints"]
@@ -87,8 +93,8 @@ def study(path: str, recordings: Path, n: int, output: Path, workers: int = 1) -
         recordings: a dataset of the bag with videos, in which the hand enters the zone now and then.
         n: starts.
     """
-    zone = mark(load_filter(path), recordings)
-    law = load_filter(path).config.law.name
+    filter = loaded(path)
+    zone, law = mark(filter, recordings), filter.config.law.name
     jobs = [
         {"filter": path, "law": law, "zone": zone, "constraints": names, "seed": FIRST_SEED + i}
         for names in CASES.values()

@@ -14,9 +14,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from lerobot_latentsafe.datasets.folder import load_metadata
 from lerobot_latentsafe.dubins import car
-from lerobot_latentsafe.evaluation.rollouts import Choice, steps
 from lerobot_latentsafe.evaluation.statistics import confusion, provenance, run_resumable, wilson, write_json
 from lerobot_latentsafe.experiments.assurance.constraints import (
     GRID,
@@ -25,15 +23,14 @@ from lerobot_latentsafe.experiments.assurance.constraints import (
     N_STATES,
     PROPOSAL_STEPS,
     RUN,
-    Cars,
     Case,
+    Filters,
     Truth,
-    dedicated,
     drive,
     runs_of,
 )
-from lerobot_latentsafe.experiments.dubins.monitor import LatentMonitor
-from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
+from lerobot_latentsafe.experiments.dubins.monitor import LatentMonitor, safe_policy_rollouts
+from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 from lerobot_latentsafe.reports.figures import save
 
 BEND, WAVES, HALF_WIDTH = 0.31, 2.0, 0.17
@@ -65,19 +62,8 @@ CHANNEL = Case({"walls": lambda s: HALF_WIDTH - np.abs(s[..., 1] - middle(s[...,
 """What is forbidden is all beyond the walls; a reckless driver heads for the nearest one."""
 
 
-class Study:
-    """Filters of the channel on one world model, each trained once and kept in a folder.
-
-    Args:
-        base: the filter whose world model is used.
-        dataset_root: cached recordings of `latentsafe collect --source=random_located`.
-        folder: where filters are kept.
-        steps: gradient steps of each critic.
-    """
-
-    def __init__(self, base: str, dataset_root: Path, folder: Path, steps: int):
-        self.base, self.folder, self.steps = base, folder, steps
-        self.meta = load_metadata("latentsafe/car_located", dataset_root)
+class Study(Filters):
+    """The channel under several laws."""
 
     @cached_property
     def truth(self) -> Truth:
@@ -86,10 +72,7 @@ class Study:
 
     def policy(self, law: str, seed: int) -> LatentSafePolicy:
         """The filter of a seed under a law."""
-        folder = self.folder / f"channel_{seed}"
-        if not folder.exists():
-            dedicated(self.base, self.meta, CHANNEL, seed, self.steps, folder)
-        policy = load_filter(folder)
+        policy = self.dedicated("channel", CHANNEL, seed)
         options = {"proposal_steps": PROPOSAL_STEPS, "epsilon": EPSILON, **LAWS[law]}
         policy.config.change(law=replace(policy.config.law, **options))
         return policy
@@ -107,26 +90,10 @@ class Study:
         if job["what"] == "shielded":
             return runs_of(drive(policy, CHANNEL, starts))
         if job["what"] == "fallback":
-            failed = fall_back(monitor, starts)
+            failed = safe_policy_rollouts(monitor, starts, RUN, CHANNEL.margin)["failed"]
             return {"violation": wilson(int(failed.sum()), len(failed))}
         states, value = truth.sample(N_STATES, 0, CHANNEL.margin(truth.states) > 0)
         return {"verdicts": confusion(monitor.value(states) > 0, value > 0)}
-
-
-def fall_back(monitor: LatentMonitor, starts: np.ndarray) -> np.ndarray:
-    """Whether the fallback policy alone hits a wall from each start: bool (N,)."""
-    failed, act, alive = np.zeros(len(starts), bool), monitor.start(), np.ones(len(starts), bool)
-
-    def choose(states: np.ndarray) -> Choice:
-        nonlocal alive
-        rates, driving = np.zeros(len(states)), alive & car.in_view(states)
-        rates[driving] = act(states[driving], driving[alive])
-        alive = driving
-        return Choice(rates)
-
-    for step in steps(Cars(starts, RUN), choose):
-        failed |= step.alive & car.in_view(step.info) & (CHANNEL.margin(step.info) < 0)
-    return failed
 
 
 def study(base: str, dataset_root: Path, folder: Path, seeds: list[int], n_steps: int, output: Path) -> None:

@@ -33,7 +33,7 @@ from lerobot_latentsafe.reports.figures import save
 from lerobot_latentsafe.runtime.hub import save_policy
 from lerobot_latentsafe.safety_model import SafetyModel
 from lerobot_latentsafe.shield import Shield
-from lerobot_latentsafe.training import fit_margin, learn_critic, load_with_cache, seen_and_imagined
+from lerobot_latentsafe.training import fit_new_margin, learn_critic, load_with_cache
 
 GRID, HEADINGS = 67, 48
 """Nodes of the exact solution, over the camera's view."""
@@ -162,10 +162,7 @@ def dedicated(path: str, meta, case: Case, seed: int, steps: int, folder: Path) 
     smaller(policy)
     positions = numbers_named(meta, [*ALIKE])
     reader.labels = replace(reader.labels, failure=(case.margin(positions) < 0).astype(np.int8))
-    config, generator = policy.config, torch.Generator().manual_seed(seed)
-    features, failure = seen_and_imagined(policy.model, reader, config.margin.clips, generator)
-    policy.model.margin = policy.model.new_margin()
-    fit_margin(policy.model.margin, features, failure, config.margin, generator)
+    fit_new_margin(policy.model, reader, torch.Generator().manual_seed(seed))
     learn_critic(policy, reader, seed, steps)
     save_policy(policy, folder)
 
@@ -279,7 +276,7 @@ def starts_of(truth: Truth, n: int, seed: int) -> np.ndarray:
     return truth.sample(n, seed, (truth.value > 0.05) & inner)[0]
 
 
-class Study:
+class Filters:
     """Filters of one world model, each trained once and kept in a folder.
 
     Args:
@@ -292,19 +289,33 @@ class Study:
     def __init__(self, base: str, dataset_root: Path, folder: Path, steps: int):
         self.base, self.folder, self.steps = base, folder, steps
         self.meta = load_metadata("latentsafe/car_located", dataset_root)
+
+    def constrained(self, seed: int) -> LatentSafePolicy:
+        """The filter that takes constraints."""
+        folder = self.folder / f"constrained_{seed}"
+        if not folder.exists():
+            constrained(self.base, self.meta, seed, self.steps, folder)
+        return load_filter(folder)
+
+    def dedicated(self, name: str, case: Case, seed: int) -> LatentSafePolicy:
+        """The filter that was trained for a case, which is kept under this name."""
+        folder = self.folder / f"{name.replace(' ', '_')}_{seed}"
+        if not folder.exists():
+            dedicated(self.base, self.meta, case, seed, self.steps, folder)
+        return load_filter(folder)
+
+
+class Study(Filters):
+    """Constraints by several methods."""
+
+    def __init__(self, base: str, dataset_root: Path, folder: Path, steps: int):
+        super().__init__(base, dataset_root, folder, steps)
         self.episodes = recordings(400, RECORDINGS)
         self.truth = cache(lambda name: Truth(CASES[name]))
 
     def policy(self, name: str, method: str, seed: int) -> LatentSafePolicy:
         """A filter for a case, by a method, under the study's law."""
-        special = name if method == "dedicated" else "constrained"
-        folder = self.folder / f"{special.replace(' ', '_')}_{seed}"
-        if not folder.exists():
-            if method == "dedicated":
-                dedicated(self.base, self.meta, CASES[name], seed, self.steps, folder)
-            else:
-                constrained(self.base, self.meta, seed, self.steps, folder)
-        policy = load_filter(folder)
+        policy = self.dedicated(name, CASES[name], seed) if method == "dedicated" else self.constrained(seed)
         law = replace(policy.config.law, lookahead=LOOKAHEAD, proposal_steps=PROPOSAL_STEPS, epsilon=EPSILON)
         policy.config.change(law=law)
         if method != "dedicated":

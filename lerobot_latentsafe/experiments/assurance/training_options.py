@@ -5,20 +5,20 @@ same starts under both laws.
 """
 
 from dataclasses import replace
+from itertools import batched
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from lerobot_latentsafe.datasets.folder import load_metadata
 from lerobot_latentsafe.decision import LawOptions
 from lerobot_latentsafe.evaluation.statistics import provenance, run_resumable, write_json
 from lerobot_latentsafe.experiments.assurance import laws
-from lerobot_latentsafe.experiments.bag import policies
+from lerobot_latentsafe.experiments.bag import operators, policies
 from lerobot_latentsafe.experiments.filter_settings import FilterSetting, as_job
 from lerobot_latentsafe.runtime.hub import save_policy
-from lerobot_latentsafe.training import fit_margin, frames_of_success, learn_critic, load_with_cache, seen_and_imagined
+from lerobot_latentsafe.training import fit_new_margin, frames_of_success, learn_critic, load_with_cache
 
 OPTIONS: dict[str, dict[str, float]] = {
     "as shipped": {},
@@ -39,16 +39,14 @@ def train(path: str, meta: Any, options: dict[str, float], seed: int, folder: Pa
         options: see OPTIONS.
     """
     policy, reader = load_with_cache(path, meta, seed)
-    config, generator = policy.config, torch.Generator().manual_seed(seed)
+    config = policy.config
     law, hinge = config.law, options.get("hinge", 0.0)
     config.change(
         margin=replace(config.margin, gradient_penalty=options.get("gradient_penalty", 0.0)),
         reachability=replace(config.reachability, hinge=hinge),
         frame_cache=None,
     )
-    features, failure = seen_and_imagined(policy.model, reader, config.margin.clips, generator)
-    policy.model.margin = policy.model.new_margin()
-    fit_margin(policy.model.margin, features, failure, config.margin, generator)
+    fit_new_margin(policy.model, reader, torch.Generator().manual_seed(seed))
     succeeds = frames_of_success(meta.root, reader) if hinge else None
     learn_critic(policy, reader, seed, None, succeeds=succeeds)
     config.change(law=law)
@@ -59,12 +57,24 @@ def run(job: dict) -> dict:
     """One episode of an operator, or of a policy, under a filter."""
     torch.set_num_threads(1)
     if "operator" in job:
-        return laws.outcome(laws.operators.run(job))
+        return laws.outcome(operators.run(job))
     return laws.outcome(policies.run(job))
 
 
+def jobs_of(filters: dict[str, Path], behaviors: list[str], policy: str | None) -> dict[tuple[str, str, str], dict]:
+    """(Who drives, options, law) -> the job of an episode but its seed; bare, and each filter under both laws."""
+    settings: dict[tuple[str, str], FilterSetting | None] = {("bare", "bare"): None}
+    for name, folder in filters.items():
+        settings |= {(name, law): FilterSetting.of(str(folder), LawOptions(name=law)) for law in laws.LAWS}
+    jobs: dict[tuple[str, str, str], dict] = {}
+    for made, setting in settings.items():
+        jobs |= {(who, *made): {"operator": who, "filter": as_job(setting)} for who in behaviors}
+        jobs |= {("policy", *made): policies.as_policy_job(policy, setting)} if policy else {}
+    return jobs
+
+
 def study(
-    base: str, dataset_root: Path, options: list[str], operators: list[str], policy: str | None, n: int, seed: int,
+    base: str, dataset_root: Path, options: list[str], behaviors: list[str], policy: str | None, n: int, seed: int,
     folder: Path, output: Path, workers: int = 1,
 ) -> None:  # fmt: skip
     """Train each filter that is missing, drive, and write the table.
@@ -72,27 +82,21 @@ def study(
     Args:
         base: the filter whose world model and law are used.
         options: names in OPTIONS.
-        operators: of the bag.
+        behaviors: of operators of the bag.
         policy: path of a policy of the bag, or none.
         n: starts of each.
         folder: where filters are kept.
     """
     meta = load_metadata("latentsafe/bag_cache", dataset_root)
-    for name in options:
-        if not (made := folder / f"{name.replace(' ', '_')}_{seed}").exists():
+    filters = {name: folder / f"{name.replace(' ', '_')}_{seed}" for name in options}
+    for name, made in filters.items():
+        if not made.exists():
             train(base, meta, OPTIONS[name], seed, made)
-    jobs: dict[tuple[str, str, str], dict] = {}
-    for name in options:
-        for law in laws.LAWS:
-            setting = FilterSetting.of(str(folder / f"{name.replace(' ', '_')}_{seed}"), LawOptions(name=law))
-            jobs |= {(who, name, law): {"operator": who, "filter": as_job(setting)} for who in operators}
-            jobs |= {("policy", name, law): policies.as_policy_job(policy, setting)} if policy else {}
-    jobs |= {(who, "bare", ""): {"operator": who, "filter": None} for who in operators}
-    jobs |= {("policy", "bare", ""): policies.as_policy_job(policy, None)} if policy else {}
+    jobs = jobs_of(filters, behaviors, policy)
     every = [{**job, "seed": FIRST_SEED + i} for job in jobs.values() for i in range(n)]
     rows = run_resumable(output.with_suffix(".jsonl"), every, run, workers)
     summary: dict[str, dict] = {}
-    for (who, name, law), of in zip(jobs, np.array_split(np.array(rows, object), len(jobs))):
-        summary.setdefault(who, {}).setdefault(name, {})[law or "bare"] = laws.cell([*of])
+    for (who, name, law), of in zip(jobs, batched(rows, n)):
+        summary.setdefault(who, {}).setdefault(name, {})[law] = laws.cell([*of])
     minutes = sum(row["cpu_s"] for row in rows) / 60
     write_json(output, {"summary": summary, "options": OPTIONS, **provenance([seed], minutes)})

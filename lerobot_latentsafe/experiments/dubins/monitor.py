@@ -22,6 +22,10 @@ Driver = Callable[[np.ndarray, np.ndarray], np.ndarray]
 tick before they are; gives turn rates (M,)."""
 
 
+Margin = Callable[[np.ndarray], np.ndarray]
+"""l of states (N, 3) -> (N,), negative where they fail."""
+
+
 class Monitor(Protocol):
     """A safety value and a fallback policy for the car."""
 
@@ -196,8 +200,8 @@ class CarWorld:
         info: all states (N, 3), and which of them are failures in view: bool (N,).
     """
 
-    def __init__(self, starts: np.ndarray, n_steps: int):
-        self.left, self._drives = n_steps, np.ones(len(starts), bool)
+    def __init__(self, starts: np.ndarray, n_steps: int, margin: Margin = car.margin):
+        self.margin, self.left, self._drives = margin, n_steps, np.ones(len(starts), bool)
         self._kept = self._drives
         self.info = (starts.copy(), np.zeros(len(starts), bool))
 
@@ -215,20 +219,20 @@ class CarWorld:
         states, failing = self.info[0].copy(), self.info[1].copy()
         states[self._drives] = car.step(states[self._drives], turn_rates)
         visible = car.in_view(states)
-        failing |= self._drives & visible & (car.margin(states) < 0)
+        failing |= self._drives & visible & (self.margin(states) < 0)
         before, self._drives = self._drives, self._drives & visible & ~failing
         self._kept = self._drives[before]
         self.info, self.left = (states, failing), self.left - 1
 
 
-def safe_policy_rollouts(monitor: Monitor, starts: np.ndarray, n_steps: int = 100) -> dict:
+def safe_policy_rollouts(monitor: Monitor, starts: np.ndarray, n_steps: int = 100, margin: Margin = car.margin) -> dict:
     """Let the fallback policy drive from each start: {safe, n} and the trajectories.
 
     A run is safe if the car never enters the failure set within `n_steps` while it is in the camera's view;
     a car that has left the view is no longer seen and its run is over.
     """
     act, trajectory, failed = monitor.start(), [starts], np.zeros(len(starts), bool)
-    for step in steps(CarWorld(starts, n_steps), lambda seen: Choice(act(*seen))):
+    for step in steps(CarWorld(starts, n_steps, margin), lambda seen: Choice(act(*seen))):
         states, failed = step.info
         trajectory.append(states)
     return {
