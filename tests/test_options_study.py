@@ -4,9 +4,11 @@ import json
 
 import pytest
 
+from lerobot_latentsafe.decision import LawOptions
 from lerobot_latentsafe.experiments.assurance import laws
 from lerobot_latentsafe.experiments.assurance import training_options as study_module
-from lerobot_latentsafe.experiments.assurance.training_options import OPTIONS, jobs_of, study, train
+from lerobot_latentsafe.experiments.assurance.training_options import OPTIONS, Drivers, jobs_of, study, train
+from lerobot_latentsafe.experiments.filter_settings import FilterSetting
 from lerobot_latentsafe.modeling_latentsafe import load_filter
 
 
@@ -22,21 +24,29 @@ def test_a_hinge_needs_recordings_that_tell_what_succeeds(tiny_world_model, cach
     assert not (tmp_path / "made").exists()
 
 
-def test_all_are_driven_bare_and_under_both_laws(tiny_filter):
-    jobs = jobs_of({"hinge": tiny_filter}, ["closed_end"], None)
-    assert [*jobs] == [("closed_end", "bare", "bare"), *(("closed_end", "hinge", law) for law in laws.LAWS)]
-    assert [job["filter"] and job["filter"]["law"] for job in jobs.values()] == [None, *laws.LAWS]
-    json.dumps([*jobs.values()])
+def test_all_are_driven_bare_and_under_a_filter(tiny_filter):
+    setting = FilterSetting.of(str(tiny_filter), LawOptions(name="nearest"))
+    bag = jobs_of([None, setting], Drivers("bag", ["closed_end"], {"mixed": str(tiny_filter)}), 2)
+    assert {who: len(jobs) for who, jobs in bag.items()} == {"closed_end": 4, "mixed": 4}
+    car = jobs_of([None, setting], Drivers("car", [], {"reckless": str(tiny_filter)}), 2)
+    assert [(job["filter"] and job["filter"]["law"], job["n"]) for job in car["reckless"]] == [
+        (None, 2),
+        ("nearest", 2),
+    ]
+    json.dumps([bag, car])
 
 
-def test_the_table_has_a_cell_for_each(monkeypatch, tiny_filter, tmp_path):
+def test_the_table_has_a_cell_for_each_and_keeps_other_rows(monkeypatch, tiny_filter, tmp_path):
     row = {"violation": True, "success": False, "stall": False}
     monkeypatch.setattr(study_module, "load_metadata", lambda name, root: None)
     monkeypatch.setattr(study_module, "train", lambda path, meta, options, seed, folder: folder.symlink_to(tiny_filter))
-    monkeypatch.setattr(study_module, "run", lambda job: row)
+    monkeypatch.setattr(study_module, "run", lambda job: {"episodes": [row] * job.get("n", 1)})
     output = tmp_path / "options.json"
-    study("bag", tmp_path, ["hinge"], ["closed_end"], None, 2, 0, tmp_path, output)
+    for drivers, seeds in ((Drivers("bag", ["closed_end"], {}), [0]), (Drivers("car", [], {"fast": "bag"}), [0, 1])):
+        study("bag", tmp_path, ["hinge"], drivers, 2, seeds, tmp_path, output)
     table = json.loads(output.read_text())
-    cells = table["summary"]["closed_end"]
-    assert {*cells} == {"bare", "hinge"} and {*cells["hinge"]} == {*laws.LAWS} and table["options"] == OPTIONS
-    assert cells["bare"]["bare"]["violation"]["k"] == 2
+    assert {*table["summary"]} == {"closed_end", "fast"} and table["options"] == OPTIONS
+    assert table["runs"]["closed_end"]["seeds"] == [0] and table["runs"]["fast"]["seeds"] == [0, 1]
+    cells = table["summary"]["fast"]
+    assert {*cells} == {"bare", "hinge"} and {*cells["hinge"]} == {*laws.LAWS}
+    assert cells["bare"]["bare"]["violation"]["n"] == 2 and cells["hinge"]["nearest"]["violation"]["n"] == 4

@@ -47,6 +47,26 @@ def compare_policies(bases: Mapping[str, str], filters: Sequence[str], n: int, l
     return table
 
 
+def compare_laws(base: str, filters: Sequence[str], laws: Sequence[str], n: int) -> dict[str, dict]:
+    """A policy bare, and under each filter by each law, from n starts.
+
+    Args:
+        base, filters: paths.
+
+    Returns:
+        `bare`, and law -> filter's path: rates, and under a filter those that `compare_policies` gives beside them.
+    """
+    bare = run(BasePolicy.load(base), n)
+    table: dict[str, dict] = {"bare": bare.rates()}
+    for law in laws:
+        table[law] = {}
+        for filter in filters:
+            shielded = run(load_filter(filter, law=LawOptions(name=law), base_policy=base), n)
+            print(f"{law} of {filter}: {in_short(bare)} bare, {in_short(shielded)} shielded", flush=True)
+            table[law][filter] = {**shielded.rates(), **_beside(bare, shielded)}
+    return table
+
+
 def compare_operators(filters: Sequence[str], n: int, law: LawOptions) -> dict[str, dict]:
     """The reckless and the careful operator from n starts, bare and under each filter.
 

@@ -89,17 +89,22 @@ def run(job: dict) -> dict:
     study, setting = STUDIES[job["study"]], FilterSetting.from_job(job["filter"])
     if study.env is None:
         return {"episodes": [outcome(operators.run({**job, "operator": study.drivers[job["driver"]]}))]}
-    policy = operators.load(setting, study.drivers[job["driver"]])
-    runs = run_episodes(policy, study.env(), job["n"], job["seed"])
-    rows: list[dict] = [{name: bool(getattr(runs, name)[i]) for name in OUTCOMES} for i in range(job["n"])]
+    return {"episodes": drive(study.env(), study.drivers[job["driver"]], setting, job["n"], job["seed"])}
+
+
+def drive(env: EnvConfig, base: str, setting: FilterSetting | None, n: int, seed: int) -> list[dict]:
+    """Episodes of a policy in an environment, bare or under a filter, from n starts; see `run`."""
+    policy = operators.load(setting, base)
+    runs = run_episodes(policy, env, n, seed)
+    rows: list[dict] = [{name: bool(getattr(runs, name)[i]) for name in OUTCOMES} for i in range(n)]
     if not isinstance(policy, LatentSafePolicy):
-        return {"episodes": rows}
+        return rows
     distance = Distance(policy.model.units)
     for row, trace in zip(rows, runs.traces):
         done, wanted = (np.array(trace[name], np.float32) for name in ("action", "proposed"))
         away = distance(done, wanted).round(4).tolist()
         row |= {"changed": trace["intervened"], "adjusted": trace["adjusted"], "deviation": away}
-    return {"episodes": rows}
+    return rows
 
 
 def outcome(row: dict) -> dict:

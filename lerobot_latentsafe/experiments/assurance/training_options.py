@@ -1,22 +1,24 @@
 """What two options of training change: a gradient penalty on the margin, and a hinge on V where recordings succeed.
 
-Each filter is trained anew on one world model, on the same recordings and seed, and shields the same drivers from the
+Each filter is trained anew on one world model, on the same recordings and seeds, and shields the same drivers from the
 same starts under both laws.
 """
 
+import json
 from dataclasses import replace
-from itertools import batched
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
+from lerobot.envs.configs import EnvConfig
 
 from lerobot_latentsafe.datasets.folder import load_metadata
 from lerobot_latentsafe.decision import LawOptions
+from lerobot_latentsafe.envs.configuration_envs import LatentSafeDubinsEnv, LatentSafeSO101Env
 from lerobot_latentsafe.evaluation.statistics import provenance, run_resumable, write_json
 from lerobot_latentsafe.experiments.assurance import laws
 from lerobot_latentsafe.experiments.bag import operators, policies
-from lerobot_latentsafe.experiments.filter_settings import FilterSetting, as_job
+from lerobot_latentsafe.experiments.filter_settings import FilterSetting, as_job, fingerprint
 from lerobot_latentsafe.runtime.hub import save_policy
 from lerobot_latentsafe.training import fit_new_margin, frames_of_success, learn_critic, load_with_cache
 
@@ -29,6 +31,22 @@ OPTIONS: dict[str, dict[str, float]] = {
 """Those that are compared."""
 FIRST_SEED = 330_000
 """Of the starts."""
+ENVS: dict[str, type[EnvConfig]] = {"car": LatentSafeDubinsEnv, "so101": LatentSafeSO101Env}
+"""Where policies drive side by side. On the bag, operators and policies move one hand."""
+
+
+class Drivers(NamedTuple):
+    """Who is shielded.
+
+    Attributes:
+        place: `bag`, or a name in ENVS.
+        operators: of the bag, names.
+        policies: name -> path.
+    """
+
+    place: str
+    operators: list[str]
+    policies: dict[str, str]
 
 
 def train(path: str, meta: Any, options: dict[str, float], seed: int, folder: Path) -> None:
@@ -54,49 +72,67 @@ def train(path: str, meta: Any, options: dict[str, float], seed: int, folder: Pa
 
 
 def run(job: dict) -> dict:
-    """One episode of an operator, or of a policy, under a filter."""
+    """`episodes` of an operator, or of a policy, under a filter; see `laws.run`."""
     torch.set_num_threads(1)
-    if "operator" in job:
-        return laws.outcome(operators.run(job))
-    return laws.outcome(policies.run(job))
+    if "env" in job:
+        setting = FilterSetting.from_job(job["filter"])
+        return {"episodes": laws.drive(ENVS[job["env"]](), job["base"], setting, job["n"], job["seed"])}
+    return {"episodes": [laws.outcome((operators if "operator" in job else policies).run(job))]}
 
 
-def jobs_of(filters: dict[str, Path], behaviors: list[str], policy: str | None) -> dict[tuple[str, str, str], dict]:
-    """(Who drives, options, law) -> the job of an episode but its seed; bare, and each filter under both laws."""
-    settings: dict[tuple[str, str], FilterSetting | None] = {("bare", "bare"): None}
-    for name, folder in filters.items():
-        settings |= {(name, law): FilterSetting.of(str(folder), LawOptions(name=law)) for law in laws.LAWS}
-    jobs: dict[tuple[str, str, str], dict] = {}
-    for made, setting in settings.items():
-        jobs |= {(who, *made): {"operator": who, "filter": as_job(setting)} for who in behaviors}
-        jobs |= {("policy", *made): policies.as_policy_job(policy, setting)} if policy else {}
+def jobs_of(settings: list[FilterSetting | None], drivers: Drivers, n: int) -> dict[str, list[dict]]:
+    """Who drives -> jobs for n starts under each of these filters, or bare."""
+    starts = [{"seed": FIRST_SEED + i} for i in range(n)]
+    jobs: dict[str, list[dict]] = {}
+    for setting in settings:
+        filter = as_job(setting)
+        for who in drivers.operators:
+            jobs.setdefault(who, []).extend({"operator": who, "filter": filter, **start} for start in starts)
+        for who, path in drivers.policies.items():
+            if drivers.place == "bag":
+                more = [{**policies.as_policy_job(path, setting), **start} for start in starts]
+            else:
+                made_of = {"env": drivers.place, "base": path, "base_fingerprint": fingerprint(path)}
+                more = [{**made_of, "filter": filter, "seed": FIRST_SEED, "n": n}]
+            jobs.setdefault(who, []).extend(more)
     return jobs
 
 
 def study(
-    base: str, dataset_root: Path, options: list[str], behaviors: list[str], policy: str | None, n: int, seed: int,
-    folder: Path, output: Path, workers: int = 1,
+    base: str, dataset_root: Path, options: list[str], drivers: Drivers, n: int, seeds: list[int], folder: Path,
+    output: Path, workers: int = 1,
 ) -> None:  # fmt: skip
-    """Train each filter that is missing, drive, and write the table.
+    """Train each filter that is missing, drive, and write the table; what it held of other drivers stays.
 
     Args:
         base: the filter whose world model and law are used.
+        dataset_root: of cached recordings.
         options: names in OPTIONS.
-        behaviors: of operators of the bag.
-        policy: path of a policy of the bag, or none.
         n: starts of each.
+        seeds: of margin and critic; a cell is of all of them.
         folder: where filters are kept.
     """
-    meta = load_metadata("latentsafe/bag_cache", dataset_root)
-    filters = {name: folder / f"{name.replace(' ', '_')}_{seed}" for name in options}
-    for name, made in filters.items():
-        if not made.exists():
-            train(base, meta, OPTIONS[name], seed, made)
-    jobs = jobs_of(filters, behaviors, policy)
-    every = [{**job, "seed": FIRST_SEED + i} for job in jobs.values() for i in range(n)]
-    rows = run_resumable(output.with_suffix(".jsonl"), every, run, workers)
+    meta = load_metadata(f"latentsafe/{drivers.place}_cache", dataset_root)
+    cells: dict[tuple[str, str], list[FilterSetting | None]] = {("bare", "bare"): [None]}
+    for name in options:
+        made = [folder / f"{name.replace(' ', '_')}_{seed}" for seed in seeds]
+        for path, seed in zip(made, seeds):
+            if not path.exists():
+                train(base, meta, OPTIONS[name], seed, path)
+        for law in laws.LAWS:
+            cells[name, law] = [FilterSetting.of(str(path), LawOptions(name=law)) for path in made]
+    jobs = {cell: jobs_of(settings, drivers, n) for cell, settings in cells.items()}
+    every = [job for of in jobs.values() for each in of.values() for job in each]
+    kept = run_resumable(output.with_suffix(".jsonl"), every, run, workers)
+    rows = iter(kept)
     summary: dict[str, dict] = {}
-    for (who, name, law), of in zip(jobs, batched(rows, n)):
-        summary.setdefault(who, {}).setdefault(name, {})[law] = laws.cell([*of])
-    minutes = sum(row["cpu_s"] for row in rows) / 60
-    write_json(output, {"summary": summary, "options": OPTIONS, **provenance([seed], minutes)})
+    for (name, law), of in jobs.items():
+        for who, each in of.items():
+            episodes = [row for _ in each for row in next(rows)["episodes"]]
+            summary.setdefault(who, {}).setdefault(name, {})[law] = laws.cell(episodes)
+    made_by = provenance(seeds, sum(row["cpu_s"] for row in kept) / 60)
+    before = json.loads(output.read_text()) if output.exists() else made_by
+    runs = {**before.get("runs", {}), **dict.fromkeys(summary, made_by)}
+    write_json(
+        output, {**before, "summary": {**before.get("summary", {}), **summary}, "options": OPTIONS, "runs": runs}
+    )
