@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from lerobot_latentsafe.critic import HINGE_ABOVE, ReachabilityConfig, SafetyCritic, safety_bellman_target
 from lerobot_latentsafe.latent import Latent, map_latent, replace_rows, select
@@ -263,13 +263,15 @@ class LatentReachability:
         loss = critic_loss
         if self.succeeding is not None:
             loss = loss + config.hinge * self._hinge(self.succeeding)
+        metrics = weight * torch.stack([critic_loss.detach(), target.mean()])
+        self.optimizer.zero_grad(set_to_none=True)
+        received = self._backward(weight * loss, self.critic.q, metrics)
         if self.critic.actor is not None:
             through_model = config.actor_through == "world_model"
-            loss = loss - (self._imagined_value() if through_model else self._actor_objective(batch["x"]))
-        self.optimizer.zero_grad(set_to_none=True)
-        (weight * loss).backward()
-        metrics = weight * torch.stack([critic_loss.detach(), target.mean()])
-        sum_over_ranks([p.grad for group in self.optimizer.param_groups for p in group["params"]] + [metrics])
+            aim = self._imagined_value() if through_model else self._actor_objective(batch["x"])
+            # What the critic's gradients are on the other ranks comes meanwhile.
+            self._backward(-weight * aim, self.critic.actor)()
+        received()
         self.optimizer.step()
         with torch.no_grad():
             for old, new in zip(self.target.parameters(), self.critic.parameters()):
@@ -279,6 +281,13 @@ class LatentReachability:
         if not math.isfinite(error):
             raise FloatingPointError(f"critic loss is {error} at step {self.step_count}; lower --reachability.lr")
         return {"critic_loss": error, "gamma": gamma, "value": value}
+
+    @staticmethod
+    def _backward(loss: Tensor, learner: nn.Module, *more: Tensor) -> Callable[[], None]:
+        """Gradients of one part of the critic; see `sum_over_ranks`."""
+        parameters = list(learner.parameters())
+        loss.backward(inputs=parameters)
+        return sum_over_ranks([p.grad for p in parameters] + list(more))
 
     def _cautious_loss(self, error: Tensor) -> Tensor:
         """Squared error in which an overestimate, a danger missed, weighs `caution` times an underestimate."""

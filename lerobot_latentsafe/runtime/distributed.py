@@ -104,11 +104,20 @@ def any_rank(flag: Tensor) -> bool:
     return bool(mean_over_ranks(flag) > 0)
 
 
-def sum_over_ranks(tensors: list[Tensor]) -> None:
-    """Replace tensors of one type by their sums over ranks, all in one message."""
+def sum_over_ranks(tensors: list[Tensor]) -> Callable[[], None]:
+    """Replace tensors of one type by their sums over ranks, all in one message, while this rank goes on computing.
+
+    Returns:
+        Waits for the sums: until it was called, nothing may read the tensors or write to them.
+    """
     if world_size() == 1:
-        return
+        return lambda: None
     flat = torch.cat([t.flatten() for t in tensors])
-    dist.all_reduce(flat)
-    for tensor, total in zip(tensors, flat.split([t.numel() for t in tensors])):
-        tensor.copy_(total.view_as(tensor))
+    sent = dist.all_reduce(flat, async_op=True)
+
+    def receive() -> None:
+        sent.wait()
+        for tensor, total in zip(tensors, flat.split([t.numel() for t in tensors])):
+            tensor.copy_(total.view_as(tensor))
+
+    return receive
