@@ -5,7 +5,7 @@
 
 Writes results/assurance/laws.json: of each policy or operator violations, successes and stalls; how far what is
 executed is from what was proposed, and the share of steps changed; and the CPU time of a tick under both laws in turn.
-Each episode is kept in a .jsonl beside the output: a killed study goes on.
+Rows of other studies stay in it. Each episode is kept in a .jsonl beside it: a killed study goes on.
 """
 
 import argparse

@@ -83,6 +83,21 @@ def provenance(seeds: list[int], cpu_minutes: float | None = None) -> dict:
     }
 
 
+def write_rows(path: Path, summary: dict[str, dict], made_by: dict, **more: object) -> None:
+    """Write the rows of a table, where other rows that the file held stay; `runs` says how each row was made.
+
+    Args:
+        made_by: provenance of these rows; of the file, too, if it is new.
+        more: of the file.
+    """
+    before = json.loads(path.read_text()) if path.exists() else made_by
+    rows = {
+        name: {**before.get(name, {}), **new}
+        for name, new in (("summary", summary), ("runs", dict.fromkeys(summary, made_by)))
+    }
+    write_json(path, {**before, **rows, **more})
+
+
 def _commit() -> str:
     """Of the working tree this package lies in; unknown where there is none, or no git."""
     if not shutil.which("git"):

@@ -4,7 +4,6 @@ Each filter is trained anew on one world model, on the same recordings and seeds
 same starts under both laws.
 """
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +14,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot_latentsafe.datasets.folder import load_metadata
 from lerobot_latentsafe.decision import LawOptions
 from lerobot_latentsafe.envs.configuration_envs import LatentSafeDubinsEnv, LatentSafeSO101Env
-from lerobot_latentsafe.evaluation.statistics import provenance, run_resumable, write_json
+from lerobot_latentsafe.evaluation.statistics import provenance, run_resumable, write_rows
 from lerobot_latentsafe.experiments.assurance import laws
 from lerobot_latentsafe.experiments.bag import operators, policies
 from lerobot_latentsafe.experiments.filter_settings import FilterSetting, as_job, fingerprint
@@ -130,9 +129,5 @@ def study(
         for who, each in of.items():
             episodes = [row for _ in each for row in next(rows)["episodes"]]
             summary.setdefault(who, {}).setdefault(name, {})[law] = laws.cell(episodes)
-    made_by = provenance(seeds, sum(row["cpu_s"] for row in kept) / 60)
-    before = json.loads(output.read_text()) if output.exists() else made_by
-    runs = {**before.get("runs", {}), **dict.fromkeys(summary, made_by)}
-    write_json(
-        output, {**before, "summary": {**before.get("summary", {}), **summary}, "options": OPTIONS, "runs": runs}
-    )
+    minutes = sum(row["cpu_s"] for row in kept) / 60
+    write_rows(output, summary, provenance(seeds, minutes), options=OPTIONS)
