@@ -2,20 +2,33 @@
 
 import json
 import os
+import pickle
+import shutil
 import signal
-from dataclasses import dataclass
+import sys
+from contextlib import closing
+from dataclasses import dataclass, replace
 from functools import partial
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
+import tiny
 
 from lerobot_latentsafe import LatentSafeDubinsEnv
 from lerobot_latentsafe.cli import main
+from lerobot_latentsafe.collection.dubins import collect_dubins
+from lerobot_latentsafe.datasets.episodes import DatasetFrames
 from lerobot_latentsafe.evaluation.rollouts import compare
 from lerobot_latentsafe.evaluation.shield_tasks import CutComparison
+from lerobot_latentsafe.labeling.automatic import label_automatically
+from lerobot_latentsafe.labeling.label_tasks import CutLabelling
+from lerobot_latentsafe.labeling.store import LabelStore
 from lerobot_latentsafe.modeling_latentsafe import load_filter
-from lerobot_latentsafe.runtime.files import OtherRunError
+from lerobot_latentsafe.runtime import tasks
+from lerobot_latentsafe.runtime.files import OtherRunError, replacing
 from lerobot_latentsafe.runtime.tasks import Tasks, TasksFailedError
 
 pytest.importorskip("datatrove")
@@ -26,6 +39,112 @@ def die_once(mark):
     if mark.exists():
         mark.unlink()
         os.kill(os.getpid(), signal.SIGKILL)
+
+
+# -- auto-label ---
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """Episodes that enter the disc, with the recorded position."""
+    root = tmp_path_factory.mktemp("reckless") / "car"
+    collect_dubins("reckless", tiny.REPO_ID, root, n_episodes=6, seed=0)
+    return root
+
+
+@pytest.fixture
+def root(recorded, tmp_path):
+    return shutil.copytree(recorded, tmp_path / "car")
+
+
+def said_of(episode):
+    """By its number: a first failing frame, labels, nothing, or no answer."""
+    return [3, np.r_[-1, np.ones(episode.length - 1)], None, -5, 0, 1][episode.number]
+
+
+def labelling(root, labeller=said_of, model="default"):
+    frames, asked = DatasetFrames(tiny.metadata(root)), {"model": model}
+    return CutLabelling.of(frames, "entered", "test", partial(itemgetter(0), [labeller]), asked, print)
+
+
+def labels(root):
+    table = pq.read_table(root / "labels" / "entered.parquet")
+    return {name: table[name].to_pylist() for name in table.column_names if name != "labelled_at"}
+
+
+@pytest.fixture(scope="module")
+def labelled(recorded, tmp_path_factory):
+    """What one process says, and its label file."""
+    root = shutil.copytree(recorded, tmp_path_factory.mktemp("labelled") / "car")
+    with closing(LabelStore(root, tiny.REPO_ID, ["entered"])) as store:
+        result = label_automatically(store, DatasetFrames(tiny.metadata(root)), "entered", said_of, "test")
+    return result, labels(root)
+
+
+@pytest.mark.parametrize("ending", [KeyboardInterrupt, OSError(28, "No space left on device")], ids=["stopped", "full"])
+def test_labels_of_tasks_equal_those_of_one_process(root, labelled, monkeypatch, ending):
+    asked = []
+
+    def unsteady(episode):
+        asked.append(episode.number)
+        return said_of(episode)
+
+    def torn(file):
+        if file.name == "000003.pickle" and len(asked) < 6:
+            raise ending
+        return replacing(file)
+
+    monkeypatch.setattr(tasks, "replacing", torn)
+    with pytest.raises(TasksFailedError if isinstance(ending, OSError) else ending):
+        labelling(root, unsteady).run(Tasks(3))
+    assert not (root / "labels" / "entered.parquet").exists()
+    before = len(asked)
+    monkeypatch.undo()
+    assert labelling(root, unsteady).run(Tasks(2)) == labelled[0]
+    assert labels(root) == labelled[1] and asked[before:] == [e for e in range(6) if e == 3 or e not in asked[:before]]
+    assert not [path for path in root.iterdir() if path.name.startswith("labels.")]
+
+
+def test_labels_that_people_give_meanwhile_stay(root, monkeypatch):
+    work = pickle.loads(pickle.dumps(labelling(root)))  # as others get it
+    with closing(LabelStore(root, tiny.REPO_ID, ["entered"])) as store:
+        said = store.label("entered", 0, 5, "ann")
+    assert work.run(Tasks(2))["labelled"] == [1, 4, 5]
+    with closing(LabelStore(root, tiny.REPO_ID, ["entered"])) as store:
+        assert store.verdict("entered", 0) == said
+
+
+def test_answers_of_another_labeller_are_not_mixed(root, dataset_root):
+    def down(episode):
+        raise ConnectionError("refused")
+
+    with pytest.raises(TasksFailedError, match=r"1 of 1 tasks failed.*test failed on 3 episodes in a row"):
+        labelling(root, down).run(Tasks(1))
+    with pytest.raises(OtherRunError, match=r'other options \(model = "default"\).*remove that folder to begin anew'):
+        labelling(root, model="better").run(Tasks(1))
+    other = replace(labelling(root), root=dataset_root, cameras=["observation.image"])
+    with pytest.raises(OtherRunError, match=r"sees something else than .*\(dataset = "):
+        other.work(1, 0)
+
+
+def test_the_command_labels_in_tasks(root, tmp_path, monkeypatch, capsys):
+    """Its labeller lies beside the user."""
+    (tmp_path / "in_tasks.py").write_text("def first(episode):\n    return [0, -5][episode.number == 3]\n")
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.chdir(tmp_path)
+    given = [
+        "auto-label",
+        f"--dataset.repo_id={tiny.REPO_ID}",
+        f"--dataset.root={root.name}",
+        "--specification=entered",
+    ]
+    with pytest.raises(SystemExit, match="1 episodes got no label; the others are saved"):
+        main([*given, "--labeller=in_tasks:first", "--tasks.number=2"])
+    assert "labelled   5 episodes" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="is 7, and there are 6 episodes; give fewer"):
+        main([*given, "--labeller=in_tasks:first", "--tasks.number=7"])
+    main([*given, "--labeller=json:loads", "--tasks.number=1", "--dataset.episodes=[0,1]"])  # all have one
+    assert "labelled   0 episodes" in capsys.readouterr().out
 
 
 # -- eval-shield ---
@@ -104,8 +223,8 @@ def test_the_command_shields_in_tasks(tiny_filter, tiny_diffusion, tmp_path, cap
         "--env.variant=discrete", "--env.episode_length=4", "--n_episodes=3", "--batch_size=2",
     ]  # fmt: skip
     rows = []
-    for name, tasks in (("one", []), ("two", ["--tasks.number=2", f"--figure={tmp_path / 'two.png'}"])):
-        main(["eval-shield", *given, *tasks, f"--json={tmp_path / name}"])
+    for name, more in (("one", []), ("two", ["--tasks.number=2", f"--figure={tmp_path / 'two.png'}"])):
+        main(["eval-shield", *given, *more, f"--json={tmp_path / name}"])
         rows.append(json.loads((tmp_path / name).read_text()))
     assert all(rows[0][name] == rows[1][name] for name in rows[0] if name not in ("cpu_minutes", "command"))
     assert "difference in violations" in capsys.readouterr().out and (tmp_path / "two.png").exists()

@@ -130,6 +130,7 @@ class EvalShield:
         self._tell(result, policy.config.law, provenance(seeds=[self.seed]))
 
     def _in_tasks(self) -> None:
+        self.tasks.require_executor()
         output, n_videos = self.json.absolute(), self.n_videos if self.video else 0
         work = CutComparison(
             output, self._load, self.env, self.n_episodes, self.seed, self.batch_size, n_videos, self._tell,
