@@ -191,6 +191,13 @@ def test_slurm_gets_the_same_pipeline_and_a_last_task(files, slurm):
     assert "--partition=cpu" in heard and "--array=0-1%1" in heard and "--cpus-per-task=4" in heard
 
 
+def test_slurm_gets_pieces_and_a_last_task(squares, slurm):
+    options = {"partition": "cpu", "time": "0:10:00", "venv_path": "/dev/null"}
+    assert squares.run(Tasks(2, 1, "slurm", options)) is None  # submitted
+    assert squares.output.read_text() == "[0, 4, 16, 36, 64, 100, 144]", slurm.read_text()
+    assert not squares.folder.exists()
+
+
 @pytest.mark.parametrize(
     ("given", "said"),
     [

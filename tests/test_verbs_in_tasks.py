@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from operator import itemgetter
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -19,7 +20,10 @@ import tiny
 
 from lerobot_latentsafe import LatentSafeDubinsEnv
 from lerobot_latentsafe.cli import main
+from lerobot_latentsafe.collection import dubins, parts
 from lerobot_latentsafe.collection.dubins import collect_dubins
+from lerobot_latentsafe.collection.franka import collect_franka
+from lerobot_latentsafe.collection.parts import record_in_parts
 from lerobot_latentsafe.datasets.episodes import DatasetFrames
 from lerobot_latentsafe.evaluation.rollouts import compare
 from lerobot_latentsafe.evaluation.shield_tasks import CutComparison
@@ -28,8 +32,8 @@ from lerobot_latentsafe.labeling.label_tasks import CutLabelling
 from lerobot_latentsafe.labeling.store import LabelStore
 from lerobot_latentsafe.modeling_latentsafe import load_filter
 from lerobot_latentsafe.runtime import tasks
-from lerobot_latentsafe.runtime.files import OtherRunError, replacing
-from lerobot_latentsafe.runtime.tasks import Tasks, TasksFailedError
+from lerobot_latentsafe.runtime.files import OtherRunError, claim, replacing
+from lerobot_latentsafe.runtime.tasks import Tasks, TasksFailedError, UnseenFolderError
 
 pytest.importorskip("datatrove")
 
@@ -39,6 +43,104 @@ def die_once(mark):
     if mark.exists():
         mark.unlink()
         os.kill(os.getpid(), signal.SIGKILL)
+
+
+# -- collect ---
+
+N_CAR = 9
+
+
+def record_car(folder, tasks=None, record=None, n=N_CAR):
+    options = {"source": "reckless", "repo_id": "me/car", "seed": 5}
+    record = record or partial(dubins._record, "reckless", "me/car", n, 5)
+    return record_in_parts("me/car", folder, options, n, record, 2, tasks=tasks)
+
+
+def content(dataset):
+    rows = dataset.hf_dataset.with_format(None)
+    columns = {name: rows[name] for name in rows.column_names if name != "observation.image"}
+    pictures = [np.asarray(picture).tobytes() for picture in rows["observation.image"]]
+    return columns, pictures, dataset.meta.episodes["length"], dataset.meta.stats["action"]["mean"].tolist()
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """What one process records."""
+    return content(record_car(tmp_path_factory.mktemp("whole") / "car"))
+
+
+def deadly_record(mark, numbers, folder):
+    if 4 in numbers:
+        die_once(mark)
+    yield from dubins._record("reckless", "me/car", N_CAR, 5, numbers, folder)
+
+
+@pytest.mark.fault("K54", "a worker of collect is killed", "The same command records the parts that are missing")
+def test_a_dataset_of_tasks_equals_that_of_one_process(whole, tmp_path):
+    mark = tmp_path / "mark"
+    mark.touch()
+    with pytest.raises(TasksFailedError, match="a worker was killed"):
+        record_car(tmp_path / "car", Tasks(4, workers=2), partial(deadly_record, mark))
+    assert not mark.exists() and not (tmp_path / "car").exists()
+    recorded = []
+
+    def counted(numbers, folder):
+        recorded.extend(numbers)
+        return dubins._record("reckless", "me/car", N_CAR, 5, numbers, folder)
+
+    kept = [file.name for file in (tmp_path / "car.parts").glob("??????_??????")]
+    assert content(record_car(tmp_path / "car", Tasks(3), counted)) == whole
+    assert len(recorded) + sum(int(name[7:]) - int(name[:6]) for name in kept) == N_CAR and 4 in recorded
+    assert [path.name for path in tmp_path.iterdir()] == ["car"]
+
+
+@pytest.mark.fault("D09", "the disk is full in one task of collect", "The parts of the others stay; a message names it")
+def test_a_full_disk_in_one_task_leaves_the_parts_of_the_others(whole, tmp_path, monkeypatch):
+    def full(numbers, folder):
+        if 4 in numbers:
+            raise OSError(28, "No space left on device")
+        return dubins._record("reckless", "me/car", N_CAR, 5, numbers, folder)
+
+    with monkeypatch.context() as patch, pytest.raises(TasksFailedError, match=r"1 of 4 tasks .*disk of .* is full"):
+        patch.setattr(parts.shutil, "disk_usage", lambda folder: SimpleNamespace(free=0))
+        record_car(tmp_path / "car", Tasks(4), full)
+    assert len([*(tmp_path / "car.parts").glob("??????_??????")]) == 4
+    assert content(record_car(tmp_path / "car", Tasks(4))) == whole
+
+
+def test_recordings_that_cannot_be_joined_are_refused(tmp_path):
+    recording = parts.Recording("me/car", tmp_path / "car", {}, 4, partial(dubins._record, "reckless", "me/car", 4, 5))
+    with pytest.raises(UnseenFolderError, match=r"does not see .*options\.json, which.*same --dataset\.root"):
+        recording.work([[range(4)]], 0)
+    claim(recording.parts / "options.json", {})
+    recording.work([[range(2)], [range(2, 4)]], 1)
+    with pytest.raises(UnseenFolderError, match=r"does not see .*car\.parts/000000_000002, which another"):
+        recording.finish()
+    with pytest.raises(OtherRunError, match="options"):
+        record_car(tmp_path / "car", Tasks(2))
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--tasks.number=4"], "--tasks.number is 4, and there are 3 episodes; give fewer"),
+        (["--tasks.number=2", "--tasks.workers=0"], "--tasks.workers is 0"),
+    ],
+)
+def test_the_command_records_in_tasks_or_says_why_not(tmp_path, capsys, options, said):
+    given = ["collect", "--source=random", "--dataset.repo_id=me/car", "--dataset.num_episodes=3"]
+    with pytest.raises(SystemExit, match=said):
+        main([*given, f"--dataset.root={tmp_path / 'car'}", *options])
+    assert not [*tmp_path.iterdir()]
+    main([*given, f"--dataset.root={tmp_path / 'car'}", "--tasks.number=2"])
+    assert "3 episodes" in capsys.readouterr().out and [path.name for path in tmp_path.iterdir()] == ["car"]
+
+
+def test_processes_of_collect_and_tasks_are_not_both_asked_for(tmp_path):
+    with pytest.raises(
+        ValueError, match=r"--workers is 2, and --tasks\.number is given; give --tasks\.workers instead"
+    ):
+        collect_franka("bag_pulls", "me/bag", tmp_path / "bag", 4, 0, workers=2, tasks=Tasks(2))
 
 
 # -- auto-label ---

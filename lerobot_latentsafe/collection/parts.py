@@ -68,7 +68,7 @@ def record_in_parts(
     if cut:
         _require_tasks(tasks, n_episodes, workers)
     recording = Recording(repo_id, Path(root).absolute(), options, n_episodes, record)
-    with locked_folder(recording.root):
+    with locked_folder(recording.parts):  # not root, which a cluster's last task writes
         if recording.is_finished():
             discard(recording.parts)
             return recording.dataset()
