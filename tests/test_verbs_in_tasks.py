@@ -207,7 +207,7 @@ def test_labels_of_tasks_equal_those_of_one_process(root, labelled, monkeypatch,
     assert not [path for path in root.iterdir() if path.name.startswith("labels.")]
 
 
-def test_labels_that_people_give_meanwhile_stay(root, monkeypatch):
+def test_labels_that_people_give_meanwhile_stay(root):
     work = pickle.loads(pickle.dumps(labelling(root)))  # as others get it
     with closing(LabelStore(root, tiny.REPO_ID, ["entered"])) as store:
         said = store.label("entered", 0, 5, "ann")

@@ -19,10 +19,11 @@ from lerobot_latentsafe.runtime.tasks import Pieces
 
 
 class Batch(NamedTuple):
-    """Episodes from the same starts, and the CPU seconds that they took."""
+    """Episodes from the same starts, the filter's law, and the CPU seconds that they took."""
 
     bare: Episodes
     shielded: Episodes
+    law: LawConfig
     cpu_s: float
 
 
@@ -78,11 +79,11 @@ class CutComparison(Pieces[LatentSafePolicy, Batch]):
                 replace(run_episodes(actor, self.env, n, self.seed + first, n, n_videos), latents=[])
                 for actor in (policy.base, policy)
             )
-            yield Batch(bare, shielded, time.process_time() - began)
+            yield Batch(bare, shielded, policy.config.law, time.process_time() - began)
 
     def finish(self, results: list[Batch]) -> dict[str, Any]:
         """Compare all episodes, and tell."""
         result = compared(*(Episodes.joined([getattr(b, name) for b in results]) for name in ("bare", "shielded")))
         minutes = round(sum(batch.cpu_s for batch in results) / 60, 2)
-        self.tell(result, self.begin().config.law, {**self.made, "cpu_minutes": minutes})
+        self.tell(result, results[0].law, {**self.made, "cpu_minutes": minutes})
         return result
