@@ -36,6 +36,7 @@ LONGEST = (
     "test_labeling_page.py",
     "test_token_cache.py",
     "test_sharded_cache.py",
+    "test_verbs_in_tasks.py",
 )
 
 

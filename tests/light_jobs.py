@@ -1,4 +1,4 @@
-"""A job of a few files, which loads no torch: its tasks say how they are to end."""
+"""Jobs of a few files, which load no torch: their tasks say how they are to end."""
 
 import os
 import signal
@@ -6,7 +6,7 @@ import threading
 from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_latentsafe.runtime.tasks import Job
+from lerobot_latentsafe.runtime.tasks import Job, Pieces
 
 
 @dataclass(frozen=True)
@@ -33,4 +33,34 @@ class Files:
 
     def finish(self):
         done = sorted(file.name for file in self.folder.glob("*.txt"))
-        (self.folder / "all").write_text(" ".join(done))
+        return (self.folder / "all").write_text(" ".join(done))
+
+
+@dataclass(frozen=True)
+class Squares(Pieces):
+    """Squares of numbers, unless a file `<number>.<how>` says how one fails; `of` is what this computer sees."""
+
+    output: Path
+    n: int
+    of: str = "squares"
+
+    name = "squares"
+
+    @property
+    def numbers(self):
+        return range(0, 2 * self.n, 2)
+
+    def begin(self):
+        return Files(self.output.parent)
+
+    def made_of(self, files):
+        return {"of": self.of}
+
+    def do(self, files, numbers):
+        for number in numbers:
+            files.work(number)
+            yield number**2
+
+    def finish(self, results):
+        self.output.write_text(str(results))
+        return results

@@ -191,7 +191,7 @@ def test_a_full_disk_is_told_and_finished_parts_are_kept(tmp_path, monkeypatch, 
 @pytest.mark.fault("K22", "two collect into one folder", "The second is refused (`FolderInUseError`)")
 def test_two_at_once_are_told_apart(tmp_path):
     def other():
-        with locked_folder(tmp_path / "one"):
+        with locked_folder(tmp_path / "one.parts"):
             locked.set()
             done.wait()
 
@@ -199,7 +199,7 @@ def test_two_at_once_are_told_apart(tmp_path):
     thread = threading.Thread(target=other)
     thread.start()
     locked.wait()
-    with pytest.raises(FolderInUseError, match=rf"process {os.getpid()} is writing .*one already"):
+    with pytest.raises(FolderInUseError, match=rf"process {os.getpid()} is writing .*one\.parts already"):
         record(tmp_path / "one")
     done.set()
     thread.join()

@@ -25,7 +25,7 @@ from lerobot_latentsafe.datasets.frame_cache import FrameCache, FrameCacheError
 from lerobot_latentsafe.datasets.join_caches import join_caches
 from lerobot_latentsafe.datasets.labels import FailureLabels
 from lerobot_latentsafe.datasets.overview import cached_cameras
-from lerobot_latentsafe.runtime.tasks import Tasks, TasksFailedError
+from lerobot_latentsafe.runtime.tasks import Tasks, TasksFailedError, UnseenFolderError
 
 N, SIZE = 4, 8
 
@@ -188,7 +188,7 @@ def test_what_is_removed_is_made_anew_and_the_same(dataset_root, broken, sharded
 
 def test_a_node_that_sees_another_folder_says_so(dataset_root, broken, cache_root, tmp_path):
     shutil.rmtree(broken / "frame_cache" / "shards" / "00001")
-    with pytest.raises(FrameCacheError, match=r"does not see .*frame_cache, which another.*same --output_dir"):
+    with pytest.raises(UnseenFolderError, match=r"does not see .*frame_cache.*, which another.*same --output_dir"):
         build_of(dataset_root, tmp_path / "local_disk").make(1)
     with pytest.raises(FrameCacheError, match=r"sees another dataset in .*, or has another encoder"):
         build_of(dataset_root, broken, image_size=16).make(1)

@@ -7,10 +7,11 @@ import time
 
 import psutil
 import pytest
-from light_jobs import Files
+from light_jobs import Files, Squares
 
 from lerobot_latentsafe.runtime import tasks
-from lerobot_latentsafe.runtime.tasks import Tasks, TasksFailedError
+from lerobot_latentsafe.runtime.files import OtherRunError
+from lerobot_latentsafe.runtime.tasks import Tasks, TasksFailedError, UnseenFolderError, share
 
 datatrove = pytest.importorskip("datatrove")
 ALL = "0.txt 1.txt 2.txt 3.txt"
@@ -83,6 +84,76 @@ def test_a_result_that_was_removed_is_made_again(files):
     assert Tasks(4).run(files.job()) and (files.folder / "all").read_text() == ALL
 
 
+# -- pieces ---
+
+
+@pytest.fixture
+def squares(tmp_path):
+    return Squares(tmp_path / "squares", 7)
+
+
+def left(squares):
+    return sorted(path.name for path in squares.output.parent.iterdir() if path.suffix != ".txt")
+
+
+@pytest.mark.parametrize(("n", "number"), [(7, 3), (2, 4), (0, 1), (5, 5)])
+def test_all_is_shared_and_neighbours_are_in_one_task(n, number):
+    parts = share(range(n), number)
+    assert [i for part in parts for i in part] == list(range(n))
+    assert len(parts) == number and max(map(len, parts)) - min(map(len, parts)) <= 1
+
+
+@pytest.mark.parametrize("how", ["full", "killed"])
+@pytest.mark.parametrize("number", [4, 3], ids=["same number", "another number"])
+def test_pieces_are_done_once_whatever_failed_on_the_way(squares, how, number):
+    """Four tasks, two at once, one of which fails at its second piece; then the same again, or another number."""
+    mark = squares.output.with_name(f"4.{how}")
+    mark.touch()
+    with pytest.raises(TasksFailedError, match="same command does what is missing"):
+        squares.run(Tasks(4, workers=2))
+    assert not squares.output.exists() and (squares.folder / "000002.pickle").exists()
+    kept = {file.name: file.stat().st_mtime_ns for file in squares.folder.glob("*.pickle")}
+    mark.unlink()
+    assert squares.run(Tasks(number)) == [0, 4, 16, 36, 64, 100, 144]
+    texts = {file.stem: file.read_text() for file in squares.output.parent.glob("*.txt")}
+    assert len(texts) == 7 and all(texts[str(int(name[:6]))] == "once" for name in kept)
+    assert left(squares) == ["squares"]
+
+
+def test_pieces_of_something_else_are_refused_and_stay(squares):
+    (squares.output.parent / "6.full").touch()
+    with pytest.raises(TasksFailedError):
+        squares.run(Tasks(4))
+    n = len([*squares.folder.iterdir()])
+    with pytest.raises(OtherRunError, match=r'other options \(of = "squares"\).*or remove that folder to begin anew'):
+        Squares(squares.output, 7, "cubes").run(Tasks(4))
+    with pytest.raises(OtherRunError, match=r'sees something else than the process that began .*\(of = "squares"\)'):
+        Squares(squares.output, 7, "cubes").work(4, 2)
+    assert len([*squares.folder.iterdir()]) == n
+
+
+def test_a_node_that_sees_another_folder_says_so(squares, tmp_path):
+    with pytest.raises(UnseenFolderError, match=r"does not see .*options\.json.*on storage that they share"):
+        Squares(tmp_path / "local_disk" / "squares", 7).work(4, 1)
+    with pytest.raises(UnseenFolderError, match=r"does not see .*000000\.pickle"):
+        squares.end()
+
+
+def test_a_torn_piece_is_named(squares):
+    (squares.output.parent / "12.full").touch()
+    with pytest.raises(TasksFailedError):
+        squares.run(Tasks(2))
+    (squares.output.parent / "12.full").unlink()
+    piece = squares.folder / "000002.pickle"
+    piece.write_bytes(piece.read_bytes()[:-2])
+    with pytest.raises(ValueError, match=r"000002\.pickle is torn .*; remove it: the same command makes it anew"):
+        squares.run(Tasks(2))
+    piece.unlink()
+    assert len(squares.run(Tasks(2))) == 7
+
+
+# -- on a cluster ---
+
 FAKES = {
     "sbatch": """
 while [ $# -gt 1 ]; do shift; done
@@ -118,6 +189,13 @@ def test_slurm_gets_the_same_pipeline_and_a_last_task(files, slurm):
     heard = slurm.read_text()
     assert (files.folder / "all").read_text() == "0.txt 1.txt", heard
     assert "--partition=cpu" in heard and "--array=0-1%1" in heard and "--cpus-per-task=4" in heard
+
+
+def test_slurm_gets_pieces_and_a_last_task(squares, slurm):
+    options = {"partition": "cpu", "time": "0:10:00", "venv_path": "/dev/null"}
+    assert squares.run(Tasks(2, 1, "slurm", options)) is None  # submitted
+    assert squares.output.read_text() == "[0, 4, 16, 36, 64, 100, 144]", slurm.read_text()
+    assert not squares.folder.exists()
 
 
 @pytest.mark.parametrize(

@@ -9,11 +9,12 @@ from lerobot.envs.configs import EnvConfig
 
 from lerobot_latentsafe.cli.options import DatasetSource, OptionalDatasetSource
 from lerobot_latentsafe.cli.places import DefaultPolicySource, OptionalPolicySource, PolicySource
-from lerobot_latentsafe.decision import LawOptions
+from lerobot_latentsafe.decision import LawConfig, LawOptions
 from lerobot_latentsafe.dubins.ground_truth import load_states, truth_on
 from lerobot_latentsafe.encoders.patch_encoders import load_encoder
 from lerobot_latentsafe.evaluation.misses import explain_misses, read_causes
-from lerobot_latentsafe.evaluation.rollouts import check_environment, compare
+from lerobot_latentsafe.evaluation.rollouts import TOGETHER, check_environment, compare
+from lerobot_latentsafe.evaluation.shield_tasks import CutComparison
 from lerobot_latentsafe.evaluation.statistics import provenance, write_json
 from lerobot_latentsafe.evaluation.world_model import evaluate_world_model
 from lerobot_latentsafe.evaluation.yardstick import compare_world_models, summarised
@@ -21,11 +22,12 @@ from lerobot_latentsafe.experiments.bag.features import draw_features, see_varia
 from lerobot_latentsafe.experiments.dubins.figures import trajectories, value_slices
 from lerobot_latentsafe.experiments.dubins.monitor import LatentMonitor, evaluate_monitor
 from lerobot_latentsafe.experiments.dubins.report import car_parts
-from lerobot_latentsafe.modeling_latentsafe import load_filter
+from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
 from lerobot_latentsafe.reports.figures import causes_of_misses, save, write_videos
 from lerobot_latentsafe.reports.filter_report import write_filter_report
 from lerobot_latentsafe.runtime.files import replacing
 from lerobot_latentsafe.runtime.options import require_at_least
+from lerobot_latentsafe.runtime.tasks import Tasks
 from lerobot_latentsafe.training import load_with_cache
 
 CAR = "latentsafe_dubins"
@@ -83,7 +85,8 @@ class EvalShield:
     latentsafe eval-shield --policy.path=bag --base_policy_path=bag_diffusion_weak --env.type=latentsafe_bag \\
       --env.episode_length=150 --n_episodes=20 --json=outputs/shield.json
 
-    Options of --law change the filter's law; what is not given stays as it is.
+    Options of --law change the filter's law; what is not given stays as it is. With --tasks.number=N the episodes are
+    shared among N tasks, by whole --batch_size; see docs/scaling.md.
     """
 
     env: EnvConfig
@@ -96,6 +99,8 @@ class EvalShield:
     """Episodes of each, bare and shielded."""
     seed: int = 0
     """Of the first start; the next ones follow."""
+    batch_size: int = TOGETHER
+    """Episodes that run side by side; where the policy samples, the numbers depend on it."""
     json: Path | None = None
     """Where to write the numbers."""
     video: Path | None = None
@@ -104,25 +109,49 @@ class EvalShield:
     """How many."""
     figure: Path | None = None
     """Where to draw the paths of the car, .png."""
+    tasks: Tasks = field(default_factory=Tasks)
 
     def __post_init__(self) -> None:
         _require_episodes(self.n_episodes, self.seed)
         require_at_least("--n_videos", self.n_videos, 1)
+        require_at_least("--batch_size", self.batch_size, 1)
+        if self.tasks.number and not self.json:
+            raise ValueError("--tasks.number needs --json: what tasks have finished is kept beside that file")
 
     def run(self) -> None:
         """Compare, print and write."""
         if self.figure and self.env.type != CAR:
             raise ValueError(f"--figure draws paths of {CAR}, --env.type is {self.env.type!r}; give --video instead")
-        policy = load_filter(self.policy.path, law=self.law, base_policy=self.base_policy_path)
-        result = compare(policy, self.env, self.n_episodes, self.seed, self.n_videos if self.video else 0)
-        episodes, law = result.pop("episodes"), policy.config.law
+        if self.tasks.number:
+            return self._in_tasks()
+        policy = self._load()
+        n_videos = self.n_videos if self.video else 0
+        result = compare(policy, self.env, self.n_episodes, self.seed, n_videos, batch_size=self.batch_size)
+        self._tell(result, policy.config.law, provenance(seeds=[self.seed]))
+
+    def _in_tasks(self) -> None:
+        self.tasks.require_executor()
+        output, n_videos = self.json.absolute(), self.n_videos if self.video else 0
+        work = CutComparison(
+            output, self._load, self.env, self.n_episodes, self.seed, self.batch_size, n_videos, self._tell,
+            provenance(seeds=[self.seed]),
+        )  # fmt: skip
+        self.tasks.require_work(len(work.numbers), f"times --batch_size={self.batch_size} episodes")
+        if work.run(self.tasks) is None:
+            print(f"submitted: the last task writes {output}; logs are in {output}.tasks")
+
+    def _load(self) -> LatentSafePolicy:
+        return load_filter(self.policy.path, law=self.law, base_policy=self.base_policy_path)
+
+    def _tell(self, result: dict, law: LawConfig, made: dict) -> None:
+        episodes = result.pop("episodes")
         row = {
             **result,
             "epsilon": law.epsilon,
             "guard": law.proposal_steps,
             "release": law.resume_above,
             "law": law.name,
-            **provenance(seeds=[self.seed]),
+            **made,
         }
         print("\n".join(_compared(row)))
         if self.json:

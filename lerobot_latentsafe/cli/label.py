@@ -8,13 +8,16 @@ from pathlib import Path
 from lerobot_latentsafe.cli.options import DatasetSource
 from lerobot_latentsafe.cli.places import DefaultPolicySource
 from lerobot_latentsafe.datasets.columns import push_dataset, write_columns
+from lerobot_latentsafe.datasets.episodes import DatasetFrames
 from lerobot_latentsafe.datasets.labels import UNLABELLED
 from lerobot_latentsafe.evaluation.along_episodes import episode_margins
 from lerobot_latentsafe.labeling import automatic
 from lerobot_latentsafe.labeling.carrying import carry_labels, specifications_in
 from lerobot_latentsafe.labeling.disagreements import find_disagreements, write_disagreements
+from lerobot_latentsafe.labeling.label_tasks import CutLabelling
 from lerobot_latentsafe.labeling.store import LabelStore, in_words
 from lerobot_latentsafe.modeling_latentsafe import load_filter
+from lerobot_latentsafe.runtime.tasks import Tasks
 
 SHOWN = 10
 """Episodes without a label that are named."""
@@ -31,6 +34,9 @@ class AutoLabel:
     Labellers: dubins_truth (the car's recorded position), module:function (your own, see labeling/automatic.py), and
     vision_language, which asks the model at --url about --failure and takes well-formed answers only. A service's key
     is read from the environment variable LATENTSAFE_MODEL_KEY.
+
+    With --tasks.number=N the episodes are shared among N tasks; their answers become labels once all have one. See
+    docs/scaling.md.
     """
 
     labeller: str
@@ -44,20 +50,31 @@ class AutoLabel:
     """Where the model of vision_language answers, in the protocol of OpenAI's chat."""
     model: str = "default"
     """What it is called there."""
+    tasks: Tasks = field(default_factory=Tasks)
 
     def run(self) -> None:
         """Label, and say how many; exits with 1 if an episode got no answer, or one that is no label."""
         labeller = self._find()
         frames = self.dataset.frames()
+        result = self._in_tasks(frames) if self.tasks.number else self._alone(frames, labeller)
+        if result is not None and (without := result["refused"] + result["failed"]):
+            sys.exit(f"{len(without)} episodes got no label; the others are saved. The same command asks again")
+
+    def _alone(self, frames: DatasetFrames, labeller: automatic.Labeller) -> dict[str, list]:
         store = LabelStore(frames.root, frames.meta.repo_id, [self.specification])
         result = automatic.label_automatically(store, frames, self.specification, labeller, self.labeller)
-        for name, episodes in result.items():
-            print(f"{name:10s} {len(episodes)} episodes")
-        without = result["refused"] + result["failed"]
-        for episode, why in without[:SHOWN]:
-            print(f"episode {episode}: {why}")
-        if without:
-            sys.exit(f"{len(without)} episodes got no label; the others are saved. The same command asks again")
+        _tell_labelled(result)
+        return result
+
+    def _in_tasks(self, frames: DatasetFrames) -> dict[str, list] | None:
+        self.tasks.require_executor()
+        self.tasks.require_work(len(frames.episodes), "episodes")
+        asked = {name: getattr(self, name) for name in ("labeller", "failure", "url", "model")}
+        work = CutLabelling.of(frames, self.specification, self.labeller, self._find, asked, _tell_labelled)
+        result = work.run(self.tasks)
+        if result is None:
+            print(f"submitted: the last task saves the labels; logs are in {work.output}.tasks")
+        return result
 
     def _find(self) -> automatic.Labeller:
         if self.labeller != "vision_language":
@@ -66,6 +83,14 @@ class AutoLabel:
             raise ValueError("vision_language needs --failure: what counts as one, such as 'a candy left the bag'")
         endpoint = automatic.ChatEndpoint(self.url, self.model, os.environ.get("LATENTSAFE_MODEL_KEY"))
         return automatic.VisionLanguageLabeller(endpoint, self.failure)
+
+
+def _tell_labelled(result: dict[str, list]) -> None:
+    """How many episodes were labelled, and why others were not."""
+    for name, episodes in result.items():
+        print(f"{name:10s} {len(episodes)} episodes")
+    for episode, why in (result["refused"] + result["failed"])[:SHOWN]:
+        print(f"episode {episode}: {why}")
 
 
 @dataclass

@@ -18,6 +18,7 @@ from lerobot_latentsafe.datasets.decisions import FILE
 from lerobot_latentsafe.robots.shielded.config_shielded import LatentSafeShieldedConfig
 from lerobot_latentsafe.robots.shielded.shielded import connected_shield
 from lerobot_latentsafe.runtime.options import require_at_least
+from lerobot_latentsafe.runtime.tasks import Tasks
 
 
 @dataclass
@@ -55,7 +56,8 @@ class Collect:
     - so101_careful, so101_reckless: demonstrations, to the mark, or 5.5 cm past it
     - so101_mix: both, undisturbed and held now and then, with pushes by fits and starts and random motion
 
-    If a recording was killed, start it again: it goes on.
+    If a recording was killed, start it again: it goes on. With --tasks.number=N the episodes are shared among N tasks;
+    see docs/scaling.md.
     """
 
     source: str
@@ -65,6 +67,7 @@ class Collect:
     """At one seed all sources start from the same scenes: where variety counts, give each its own."""
     workers: int = 1
     """Processes that record."""
+    tasks: Tasks = field(default_factory=Tasks)
 
     def __post_init__(self) -> None:
         require_at_least("--seed", self.seed, 0)
@@ -83,7 +86,9 @@ class Collect:
             raise ValueError(f"--source is {self.source!r}; expected one of {known}")
         new = self.dataset
         quiet_recording()
-        dataset = collect(self.source, new.repo_id, new.folder, new.num_episodes, self.seed)
+        dataset = collect(self.source, new.repo_id, new.folder, new.num_episodes, self.seed, tasks=self.tasks)
+        if dataset is None:
+            return print(f"submitted: the last task writes {new.folder}; logs are in {new.folder}.tasks")
         print(f"{dataset.num_episodes} episodes, {dataset.num_frames} frames in {new.folder}")
 
 

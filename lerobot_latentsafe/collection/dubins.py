@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ from lerobot_latentsafe.collection.parts import record_in_parts
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE
 from lerobot_latentsafe.dubins import car
 from lerobot_latentsafe.dubins.ground_truth import sample_task_start
+from lerobot_latentsafe.runtime.tasks import Tasks
 
 EPISODES_A_PART = 100
 FEATURES = {
@@ -139,29 +140,34 @@ SOURCES: dict[str, Callable[[int, np.random.Generator], Iterator[Episode]]] = {
 WITH_POSITION = ("careful", "reckless", "random_located")
 
 
-def collect_dubins(source: str, repo_id: str, root: str | Path, n_episodes: int | None, seed: int) -> LeRobotDataset:
+def collect_dubins(
+    source: str, repo_id: str, root: str | Path, n_episodes: int | None, seed: int, tasks: Tasks | None = None
+) -> LeRobotDataset | None:
     """Record episodes of the car, or go on recording them; None records the paper's 2,000.
 
     Demonstrations also store the car's position as observation.environment_state, which lets a diffusion policy
     of a few hundred kB do the task; the safety filter reads images and heading only. `random_located` stores it, too:
     a filter that takes new constraints learns from it which frames are alike.
 
-    Raises:
-        ValueError: unknown source, no episodes, or an unfinished recording of another source or seed.
-        FileExistsError: root exists.
-        FolderInUseError: another process records it.
+    Returns, raises:
+        See `record_in_parts`; ValueError for an unknown source, too.
     """
     if source not in SOURCES:
         raise ValueError(f"--source is {source!r}; expected one of {', '.join(SOURCES)}")
     n = 2000 if n_episodes is None else n_episodes
-    # One stream of random numbers runs through all episodes.
-    episodes = cache(lambda: list(SOURCES[source](n, np.random.default_rng(seed))))
+    record = partial(_record, source, repo_id, n, seed)
     options = {"source": source, "repo_id": repo_id, "seed": seed}
+    return record_in_parts(repo_id, root, options, n, record, EPISODES_A_PART, tasks=tasks)
 
-    def record(numbers: range, folder: Path) -> Iterator[None]:
-        return _write(episodes()[numbers.start : numbers.stop], source, repo_id, folder)
 
-    return record_in_parts(repo_id, root, options, n, record, EPISODES_A_PART)
+@lru_cache(1)
+def _episodes(source: str, n: int, seed: int) -> list[Episode]:
+    """All of them: one stream of random numbers runs through."""
+    return list(SOURCES[source](n, np.random.default_rng(seed)))
+
+
+def _record(source: str, repo_id: str, n: int, seed: int, numbers: range, root: Path) -> Iterator[None]:
+    return _write(_episodes(source, n, seed)[numbers.start : numbers.stop], source, repo_id, root)
 
 
 def _write(episodes: list[Episode], source: str, repo_id: str, root: Path) -> Iterator[None]:

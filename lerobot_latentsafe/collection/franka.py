@@ -24,6 +24,7 @@ from lerobot_latentsafe.franka.behaviors import GRASPED, grasp, stray
 from lerobot_latentsafe.franka.scenes import CLUMSINESS, HELD_ANYWHERE, SCENES
 from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
 from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
+from lerobot_latentsafe.runtime.tasks import Tasks
 from lerobot_latentsafe.teleoperators.scripted.config_scripted import LatentSafeScriptedConfig
 from lerobot_latentsafe.teleoperators.scripted.scripted import LatentSafeScripted
 
@@ -132,18 +133,17 @@ def features(source: Source) -> dict:
 
 
 def collect_franka(
-    name: str, repo_id: str, root: str | Path, n_episodes: int | None, seed: int, workers: int = 1
-) -> LeRobotDataset:
+    name: str, repo_id: str, root: str | Path, n_episodes: int | None, seed: int, workers: int = 1,
+    tasks: Tasks | None = None,
+) -> LeRobotDataset | None:  # fmt: skip
     """Record a source, or go on recording it.
 
     Args:
         n_episodes: None takes the source's.
         workers: processes that record.
 
-    Raises:
-        ValueError: unknown source, no workers or episodes, or an unfinished recording of another source or seed.
-        FileExistsError: root exists.
-        FolderInUseError: another process records it.
+    Returns, raises:
+        See `record_in_parts`; ValueError for an unknown source, too.
     """
     if name not in SOURCES:
         raise ValueError(f"--source is {name!r}; expected one of {', '.join(SOURCES)}")
@@ -151,7 +151,7 @@ def collect_franka(
     n = source.n_episodes if n_episodes is None else n_episodes
     record = partial(_record, source, repo_id, seed)
     options = {"source": name, "repo_id": repo_id, "seed": seed}
-    return record_in_parts(repo_id, root, options, n, record, EPISODES_A_PART, workers)
+    return record_in_parts(repo_id, root, options, n, record, EPISODES_A_PART, workers, tasks)
 
 
 def _record(source: Source, repo_id: str, seed: int, episodes: range, root: Path) -> Iterator[None]:

@@ -1,12 +1,13 @@
 """Recording in parts: a run that was killed goes on with those that are missing, and never leaves a broken dataset.
 
-Each part is a finished dataset of some episodes in `<root>.parts`, recorded by one process or several. At the end they
-are put together.
+Each part is a finished dataset of some episodes in `<root>.parts`, recorded by one process or several, or by tasks on
+several computers. At the end they are put together.
 """
 
 import errno
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -23,11 +24,12 @@ from lerobot_latentsafe.runtime.files import (
     differing,
     discard,
     locked_folder,
+    refuse_filled,
     replacing_folder,
 )
 from lerobot_latentsafe.runtime.options import require_at_least
+from lerobot_latentsafe.runtime.tasks import OPTIONS, Job, Tasks, require_seen, share
 
-OPTIONS = "options.json"
 LITTLE = 2**23
 """Bytes left on a disk on which nothing can be recorded any more."""
 
@@ -38,42 +40,124 @@ Tell = Callable[[None], None]
 
 
 def record_in_parts(
-    repo_id: str, root: str | Path, options: dict, n_episodes: int, record: Record, at_once: int, workers: int = 1
-) -> LeRobotDataset:
+    repo_id: str, root: str | Path, options: dict, n_episodes: int, record: Record, at_once: int, workers: int = 1,
+    tasks: Tasks | None = None,
+) -> LeRobotDataset | None:  # fmt: skip
     """Record a dataset, or go on recording it.
 
     Args:
         options: all that an episode depends on, beside its number.
-        record: picklable, if there are several workers.
-        at_once: episodes of a part, at most; fewer, if workers would have nothing to do.
+        record: picklable, if there are several workers, or tasks.
+        at_once: episodes of a part, at most; fewer, if workers or tasks would have nothing to do.
         workers: processes that record.
+        tasks: who records, instead of these.
+
+    Returns:
+        The dataset; None if it was handed to a cluster, whose last task puts it together.
 
     Raises:
-        ValueError: no episodes, no workers, or an unfinished recording with other options.
+        ValueError: no episodes, no workers, fewer episodes than tasks, or an unfinished recording with other options.
         FileExistsError: root holds something else.
         FolderInUseError: another process records it.
+        TasksFailedError: some tasks failed; the parts of the others stay.
+        ImportError, OSError: the tasks cannot be run so; see `Tasks.require_executor`.
     """
     require_at_least("--dataset.num_episodes", n_episodes, 1)
     require_at_least("--workers", workers, 1)
-    root = Path(root).absolute()
-    parts = root.with_name(f"{root.name}.parts")
-    with locked_folder(root):
-        if not _is_finished(root, repo_id, n_episodes, parts, options):
-            with replacing_folder(root, "--dataset.root") as whole:
-                claim(parts / OPTIONS, options)
-                missing = list(_missing(parts, n_episodes, min(at_once, -(-n_episodes // workers))))
-                _record_all(partial(_record_part, record, parts), missing, workers)
-                folders = [_folder(parts, part) for part in _kept(parts, n_episodes)]
-                _put_together(repo_id, folders, whole)
-        discard(parts)
-    return LeRobotDataset(repo_id, root=root)
+    cut = tasks is not None and tasks.number is not None
+    if cut:
+        _require_tasks(tasks, n_episodes, workers)
+    recording = Recording(repo_id, Path(root).absolute(), options, n_episodes, record)
+    with locked_folder(recording.parts):  # not root, which a cluster's last task writes
+        if recording.is_finished():
+            discard(recording.parts)
+            return recording.dataset()
+        refuse_filled(recording.root, "--dataset.root")
+        claim(recording.parts / OPTIONS, options)
+        n_tasks = tasks.number if cut else workers
+        missing = list(_missing(recording.parts, n_episodes, min(at_once, -(-n_episodes // n_tasks))))
+        if cut:
+            return tasks.run(recording.job(share(missing, n_tasks)))
+        _record_all(partial(_record_part, record, recording.parts), missing, workers)
+        return recording.finish()
 
 
-def _is_finished(root: Path, repo_id: str, n_episodes: int, parts: Path, options: dict) -> bool:
-    """Whether all was recorded and put together, and the process was killed before it had removed the parts."""
-    if not root.exists() or not (parts / OPTIONS).exists() or differing(parts / OPTIONS, options):
-        return False
-    return (root / "meta").exists() and LeRobotDatasetMetadata(repo_id, root=root).total_episodes == n_episodes
+def _require_tasks(tasks: Tasks, n_episodes: int, workers: int) -> None:
+    tasks.require_executor()
+    tasks.require_work(n_episodes, "episodes")
+    if workers != 1:
+        raise ValueError(f"--workers is {workers}, and --tasks.number is given; give --tasks.workers instead")
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A dataset that is recorded in parts: all that a computer needs to know to record one. It is pickled for tasks.
+
+    Attributes:
+        root: the folder to write.
+        options, n_episodes, record: see `record_in_parts`.
+    """
+
+    repo_id: str
+    root: Path
+    options: dict
+    n_episodes: int
+    record: Record
+
+    @property
+    def parts(self) -> Path:
+        """The folder of the parts."""
+        return self.root.with_name(f"{self.root.name}.parts")
+
+    def dataset(self) -> LeRobotDataset:
+        """What was recorded."""
+        return LeRobotDataset(self.repo_id, root=self.root)
+
+    def is_finished(self) -> bool:
+        """Whether all was put together, and the process was killed before it had removed the parts."""
+        if not self.root.exists() or not (self.parts / OPTIONS).exists():
+            return False
+        if differing(self.parts / OPTIONS, self.options) or not (self.root / "meta").exists():
+            return False
+        return LeRobotDatasetMetadata(self.repo_id, root=self.root).total_episodes == self.n_episodes
+
+    def job(self, missing: Sequence[Sequence[range]]) -> Job:
+        """Tasks that record what is missing, each some parts."""
+        logs = self.root.with_name(f"{self.root.name}.tasks")
+        return Job("parts", partial(self.work, missing), partial(self.is_done, missing), self.finish, logs)
+
+    def work(self, missing: Sequence[Sequence[range]], task: int) -> None:
+        """Record the parts of a task that are not there.
+
+        Raises:
+            UnseenFolderError: this computer does not see what was begun.
+            OSError: the disk is full.
+        """
+        require_seen(self.parts / OPTIONS, "--dataset.root")
+        quiet_recording()
+        for part in missing[task]:
+            if not _folder(self.parts, part).exists():
+                for _ in _record_part(self.record, self.parts, part):
+                    pass
+
+    def is_done(self, missing: Sequence[Sequence[range]], task: int) -> bool:
+        """Whether all parts of a task are there."""
+        return all(_folder(self.parts, part).exists() for part in missing[task])
+
+    def finish(self) -> LeRobotDataset:
+        """Put the parts together, and remove them.
+
+        Raises:
+            UnseenFolderError: some are not there.
+            FileExistsError: root holds something else.
+        """
+        for part in _missing(self.parts, self.n_episodes, self.n_episodes):
+            require_seen(_folder(self.parts, part), "--dataset.root")
+        with replacing_folder(self.root, "--dataset.root") as whole:
+            folders = [_folder(self.parts, part) for part in _kept(self.parts, self.n_episodes)]
+            _put_together(self.repo_id, folders, whole)
+        discard(self.parts)
+        return self.dataset()
 
 
 def _record_all(record: Callable[[range], Iterator[None]], missing: list[range], workers: int) -> None:

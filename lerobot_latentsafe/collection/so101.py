@@ -12,6 +12,7 @@ from lerobot_latentsafe.collection.parts import record_in_parts
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE
 from lerobot_latentsafe.robots.so101_mujoco.config_so101_mujoco import LatentSafeSO101MujocoConfig
 from lerobot_latentsafe.robots.so101_mujoco.so101_mujoco import LatentSafeSO101Mujoco
+from lerobot_latentsafe.runtime.tasks import Tasks
 from lerobot_latentsafe.so101.actions import CAMERAS, EPISODE_SECONDS, FPS, IMAGE_SIZE, NAMES
 from lerobot_latentsafe.teleoperators.so101_leader.config_so101_leader import LatentSafeSO101LeaderConfig
 from lerobot_latentsafe.teleoperators.so101_leader.so101_leader import LatentSafeSO101Leader
@@ -58,19 +59,20 @@ def part_of(name: str, episode: int) -> Part:
     return parts[int(np.random.default_rng(0).permutation(len(parts))[episode % len(parts)])]
 
 
-def collect_so101(name: str, repo_id: str, root: str | Path, n_episodes: int | None, seed: int) -> LeRobotDataset:
+def collect_so101(
+    name: str, repo_id: str, root: str | Path, n_episodes: int | None, seed: int, tasks: Tasks | None = None
+) -> LeRobotDataset | None:
     """Record a source, or go on recording it; None records it whole. Episode i depends on the seed and i only.
 
-    Raises:
-        ValueError: unknown source, no episodes, or an unfinished recording of another source or seed.
-        FileExistsError: root exists.
-        FolderInUseError: another process records it.
+    Returns, raises:
+        See `record_in_parts`; ValueError for an unknown source, too.
     """
     if name not in SOURCES:
         raise ValueError(f"--source is {name!r}; expected one of {', '.join(SOURCES)}")
     n = sum(part.episodes for part in SOURCES[name]) if n_episodes is None else n_episodes
     options = {"source": name, "repo_id": repo_id, "seed": seed}
-    return record_in_parts(repo_id, root, options, n, partial(_record, name, repo_id, seed), EPISODES_A_PART)
+    record = partial(_record, name, repo_id, seed)
+    return record_in_parts(repo_id, root, options, n, record, EPISODES_A_PART, tasks=tasks)
 
 
 def _record(name: str, repo_id: str, seed: int, episodes: range, root: Path) -> Iterator[None]:

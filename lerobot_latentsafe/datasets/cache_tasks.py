@@ -11,7 +11,14 @@ from functools import partial
 from pathlib import Path
 
 from lerobot_latentsafe.datasets.build_cache import MakeRecipe, is_begun, perceive_episode
-from lerobot_latentsafe.datasets.cache_layout import Layout, contract_with_cameras, lay_out, shapes_of, write_manifest
+from lerobot_latentsafe.datasets.cache_layout import (
+    LAYOUT,
+    Layout,
+    contract_with_cameras,
+    lay_out,
+    shapes_of,
+    write_manifest,
+)
 from lerobot_latentsafe.datasets.cache_recipes import Recipe, Sight
 from lerobot_latentsafe.datasets.cache_shards import SHARDS, index_of, shard_names, write_note
 from lerobot_latentsafe.datasets.episodes import DatasetFrames
@@ -20,7 +27,7 @@ from lerobot_latentsafe.datasets.frame_cache import FOLDER, SHARDED, FrameCache,
 from lerobot_latentsafe.runtime.files import allocate, locked_folder, refuse_existing, replacing_folder
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
 from lerobot_latentsafe.runtime.options import require_at_least
-from lerobot_latentsafe.runtime.tasks import Job, Tasks
+from lerobot_latentsafe.runtime.tasks import Job, Tasks, require_seen
 
 
 def build_sharded_cache(build: "ShardedBuild", tasks: Tasks, episodes: list[int] | None = None) -> FrameCache | None:
@@ -41,8 +48,7 @@ def build_sharded_cache(build: "ShardedBuild", tasks: Tasks, episodes: list[int]
     with locked_folder(build.output_dir):
         build.lay_out(tasks.number, episodes)
         logs = build.output_dir.with_name(f"{build.output_dir.name}.tasks")
-        done = tasks.run(Job("cache", build.make, build.is_made, build.finish, logs))
-    return FrameCache.open(build.output_dir) if done else None
+        return tasks.run(Job("cache", build.make, build.is_made, build.finish, logs))
 
 
 @dataclass(frozen=True)
@@ -89,8 +95,7 @@ class ShardedBuild:
         contract = contract_with_cameras(dataset)
         frames = DatasetFrames(dataset.meta, episodes)
         frames.cameras = list(contract.cameras)
-        if n_shards > len(frames.episodes):
-            raise ValueError(f"--tasks.number is {n_shards}, and there are {len(frames.episodes)} episodes; give fewer")
+        Tasks(n_shards).require_work(len(frames.episodes), "episodes")
         kept = self.recipe(frames.cameras, self.image_size)
         layout = Layout.of(dataset.meta, frames.episodes, kept, shapes_of(contract), n_shards)
         if begun:
@@ -103,7 +108,8 @@ class ShardedBuild:
         """Make a shard, if it is not there.
 
         Raises:
-            FrameCacheError: this computer does not see what was laid out, or sees something else.
+            UnseenFolderError: this computer does not see what was laid out.
+            FrameCacheError: it sees something else.
             OSError: the disk is full.
         """
         if self.is_made(number):
@@ -119,7 +125,7 @@ class ShardedBuild:
             begun.mkdir(parents=True)
             _fill(begun, kept, Sight(frames, kept.manifest["image_size"]))
 
-    def finish(self) -> None:
+    def finish(self) -> FrameCache:
         """Write the index, which makes the shards a cache.
 
         Raises:
@@ -130,16 +136,11 @@ class ShardedBuild:
         copy = load_metadata(f"{self.repo_id}_cache", self.output_dir)
         noted = {"version": SHARDED, "repo_id": self.repo_id, **made_of, "shards": shards}
         write_manifest(self.output_dir, copy, layout.cameras, noted)
-        FrameCache.open(self.output_dir, copy)
+        return FrameCache.open(self.output_dir, copy)
 
     def _layout(self) -> Layout:
-        layout = Layout.read(self.folder)
-        if layout is None:
-            raise FrameCacheError(
-                f"{socket.gethostname()} does not see {self.folder}, which another process has laid out. All computers "
-                "must see the same --output_dir: give one on storage that they share"
-            )
-        return layout
+        require_seen(self.folder / LAYOUT, "--output_dir")
+        return Layout.read(self.folder)
 
     def _require_same(self, layout: Layout, seen: Layout) -> None:
         try:

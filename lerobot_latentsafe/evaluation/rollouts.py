@@ -24,6 +24,9 @@ from lerobot_latentsafe.guard import standing_still
 from lerobot_latentsafe.latent import Latent, select
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 
+TOGETHER = 50
+"""Episodes that run side by side, if nothing else is said. Where a policy samples, it draws for all of them at once."""
+
 # -- the loop ---
 
 
@@ -244,9 +247,20 @@ def check_environment(policy: LatentSafePolicy, env: EnvConfig) -> None:
         raise ValueError(f"environment {env.type} lacks {', '.join(missing)}; it offers {', '.join(features)}")
 
 
+def check_shielding(policy: LatentSafePolicy, env: EnvConfig) -> None:
+    """Refuse a filter without a base policy, and an environment that is not the filter's.
+
+    Raises:
+        ValueError: with the remedy, or naming what differs.
+    """
+    check_environment(policy, env)
+    if policy.base is None:
+        raise ValueError("nothing to shield: give --base_policy_path, or a checkpoint written by latentsafe wrap")
+
+
 def run_episodes(
     policy: BasePolicy | LatentSafePolicy, env: EnvConfig, n_episodes: int, seed: int,
-    batch_size: int = 50, n_videos: int = 0, seen: NearestFrames | None = None,
+    batch_size: int = TOGETHER, n_videos: int = 0, seen: NearestFrames | None = None,
 ) -> Episodes:  # fmt: skip
     """Run episodes with seeds seed, seed + 1, ...; equal seeds give equal starts.
 
@@ -337,18 +351,28 @@ def _record(traces: list[dict[str, list]], alive: np.ndarray, **columns: np.ndar
 
 def compare(
     policy: LatentSafePolicy, env: EnvConfig, n_episodes: int, seed: int, n_videos: int = 0,
-    seen: NearestFrames | None = None,
+    seen: NearestFrames | None = None, batch_size: int = TOGETHER,
 ) -> dict:  # fmt: skip
     """Bare and shielded from the same starts; the frames of the first n_videos episodes are kept, and added to `seen`.
 
     Returns:
-        bare, shielded: rates; violation_p_value: exact McNemar test on the pairs; episodes: both `Episodes`.
+        See `compared`.
+
+    Raises:
+        ValueError: nothing to shield, or an environment that is not the filter's.
     """
-    check_environment(policy, env)
-    if policy.base is None:
-        raise ValueError("nothing to shield: give --base_policy_path, or a checkpoint written by latentsafe wrap")
-    bare = run_episodes(policy.base, env, n_episodes, seed, n_videos=n_videos, seen=seen)
-    shielded = run_episodes(policy, env, n_episodes, seed, n_videos=n_videos, seen=seen)
+    check_shielding(policy, env)
+    bare = run_episodes(policy.base, env, n_episodes, seed, batch_size, n_videos, seen)
+    return compared(bare, run_episodes(policy, env, n_episodes, seed, batch_size, n_videos, seen))
+
+
+def compared(bare: Episodes, shielded: Episodes) -> dict:
+    """What a filter changed, of episodes from the same starts.
+
+    Returns:
+        bare, shielded: rates; violation_p_value: exact McNemar test on the pairs; reasons: how many decisions each
+        made; episodes: both `Episodes`.
+    """
     return {
         "bare": bare.rates(),
         "shielded": shielded.rates(),
@@ -368,9 +392,7 @@ def failures_by_epsilon(
     Raises:
         ValueError: nothing to shield, or an environment that is not the filter's.
     """
-    check_environment(policy, env)
-    if policy.base is None:
-        raise ValueError("nothing to shield: give --base_policy_path, or a checkpoint written by latentsafe wrap")
+    check_shielding(policy, env)
     for epsilon in epsilons:
         policy.config.change(law=replace(policy.config.law, epsilon=epsilon))
         runs = run_episodes(policy, env, n_episodes, seed)

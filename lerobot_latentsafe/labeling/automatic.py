@@ -10,9 +10,9 @@ import json
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import cv2
 import httpx
@@ -245,6 +245,21 @@ class _Answers:
         self.unsaved.clear()
 
 
+class Answer(NamedTuple):
+    """What a labeller says of an episode.
+
+    Attributes:
+        kind: labelled; undecided; refused: what it said is no label; failed: it said nothing.
+        labels: int8 (T,), if it gave some.
+        why: it was refused, or failed.
+    """
+
+    episode: int
+    kind: str
+    labels: np.ndarray | None = None
+    why: str = ""
+
+
 def label_automatically(
     store: LabelStore, frames: DatasetFrames, specification: str, labeller: Labeller, name: str
 ) -> dict[str, list]:
@@ -253,54 +268,80 @@ def label_automatically(
     Whatever ends it, what was answered is on disk, and another call goes on there.
 
     Returns:
-        labelled: episodes; undecided: episodes; refused: (episode, why) of answers that were no labels; failed:
-        (episode, why) of those without an answer.
+        See `sorted_answers`.
 
     Raises:
         LabellerError: so many episodes failed in a row that the next would, too.
         UnsavedAnswersError: answers could not be saved, nor later; it names them.
     """
-    open_episodes = [e for e in frames.episodes if (store.labels(specification, e) == UNLABELLED).all()]
+    to_ask, given = unlabelled(store, frames, specification), list[Answer]()
     answers = _Answers(lambda said: store.label_frames(specification, said, f"auto {name}"))
     try:
-        result = _ask(open_episodes, store, frames, labeller, name, answers)
+        for answer in ask(labeller, frames, to_ask, name, min(PATIENCE, len(to_ask))):
+            if answer.labels is not None:
+                answers.add(answer.episode, answer.labels)
+            given.append(answer)
     except UnsavedAnswersError:
         raise
     except BaseException:  # also Ctrl-C
         answers.settle()
         raise
     answers.settle()
+    return sorted_answers(given)
+
+
+def unlabelled(store: LabelStore, frames: DatasetFrames, specification: str) -> list[int]:
+    """Those of the episodes of `frames` that have no label yet."""
+    return [e for e in frames.episodes if (store.labels(specification, e) == UNLABELLED).all()]
+
+
+def sorted_answers(answers: Iterable[Answer]) -> dict[str, list]:
+    """Answers by their kind.
+
+    Returns:
+        labelled: episodes; undecided: episodes; refused: (episode, why) of answers that were no labels; failed:
+        (episode, why) of those without an answer.
+    """
+    result: dict[str, list] = {"labelled": [], "undecided": [], "refused": [], "failed": []}
+    for answer in answers:
+        result[answer.kind].append((answer.episode, answer.why) if answer.why else answer.episode)
     return result
 
 
-def _ask(
-    open_episodes: list[int], store: LabelStore, frames: DatasetFrames, labeller: Labeller, name: str, answers: _Answers
-) -> dict[str, list]:
-    result: dict[str, list] = {"labelled": [], "undecided": [], "refused": [], "failed": []}
-    in_a_row = 0
-    for number in tqdm(open_episodes, desc=name, unit="episode"):
-        length = int(store.length[number])
+def ask(
+    labeller: Labeller, frames: DatasetFrames, episodes: Sequence[int], name: str, patience: int
+) -> Iterator[Answer]:
+    """What a labeller says of some episodes, one after the other.
+
+    Args:
+        name: the labeller's.
+        patience: episodes in a row without an answer, after which it is not asked again.
+
+    Raises:
+        LabellerError: it fails on so many in a row.
+    """
+    n_labelled = in_a_row = 0
+    for number in tqdm(episodes, desc=name, unit="episode"):
+        length = frames.length(number)
         episode = Episode(number, length, ", ".join(frames.meta.episodes[number]["tasks"]), frames)
         try:
             said = labeller(episode)
-            vector = None if said is None else as_vector(said, length)
+            labels = None if said is None else as_vector(said, length)
         except AnswerError as e:
-            result["refused"].append((number, str(e)))
+            answer = Answer(number, "refused", why=str(e))
         except Exception as e:
-            result["failed"].append((number, f"{type(e).__name__}: {e}"))
+            answer = Answer(number, "failed", why=f"{type(e).__name__}: {e}")
             in_a_row += 1
-            if in_a_row == PATIENCE or in_a_row == len(open_episodes):
+            if in_a_row == patience:
                 raise LabellerError(
-                    f"{name} failed on {in_a_row} episodes in a row, last on episode {number} ({type(e).__name__}: {e})"
-                    f". The {len(result['labelled'])} labels it gave before are saved; the same command goes on there"
+                    f"{name} failed on {in_a_row} episodes in a row, last on episode {number} ({answer.why}). The "
+                    f"{n_labelled} labels it gave before are saved; the same command goes on there"
                 ) from e
-            continue
         else:
-            if vector is not None:
-                answers.add(number, vector)
-            result["undecided" if vector is None else "labelled"].append(number)
-        in_a_row = 0
-    return result
+            answer = Answer(number, "undecided" if labels is None else "labelled", labels)
+        n_labelled += answer.kind == "labelled"
+        in_a_row = in_a_row if answer.kind == "failed" else 0
+        yield answer
 
 
 def as_vector(said: "int | np.ndarray", length: int) -> np.ndarray:

@@ -65,7 +65,7 @@ def check_options(executor: str, options: dict[str, Any]) -> None:
         raise ValueError(f"--tasks.options lacks {', '.join(needed)}, which {executor} needs")
 
 
-def run_here(job: Job, number: int, workers: int, options: dict[str, Any]) -> bool:
+def run_here(job: Job, number: int, workers: int, options: dict[str, Any]) -> Any:
     """Do a job's tasks in processes of this machine, or with one worker in this process; then finish it."""
     _forget_undone(job, number)
     executor = LocalPipelineExecutor([Step(job)], number, workers, str(job.logs))
@@ -78,18 +78,17 @@ def run_here(job: Job, number: int, workers: int, options: dict[str, Any]) -> bo
                 failed[task] = error
     if failed:
         _refuse(failed, number, job.logs)
-    job.finish()
+    made = job.finish()
     discard(job.logs)
-    return True
+    return made
 
 
-def run_on_cluster(executor: type, job: Job, number: int, workers: int, options: dict[str, Any]) -> bool:
+def run_on_cluster(executor: type, job: Job, number: int, workers: int, options: dict[str, Any]) -> Any:
     """Hand a job's tasks to Slurm, with a last one that finishes it; or have Ray do them, and finish it."""
     _forget_undone(job, number)
     if executor is RayPipelineExecutor:
         RayPipelineExecutor([Step(job)], number, workers, logging_dir=str(job.logs), **options).run()
-        job.finish()
-        return True
+        return job.finish()
     activate = Path(sys.prefix) / "bin" / "activate"
     given = {"qos": "", **({"venv_path": str(activate)} if activate.exists() else {}), **options}
     first = SlurmPipelineExecutor(
@@ -99,10 +98,10 @@ def run_on_cluster(executor: type, job: Job, number: int, workers: int, options:
     SlurmPipelineExecutor(
         [Last(job)], 1, job_name=f"{job.name}_last", logging_dir=str(job.logs / "last"), depends=first, **given
     ).run()
-    return False
+    return None
 
 
-EXECUTE: dict[str, Callable[[Job, int, int, dict[str, Any]], bool]] = {
+EXECUTE: dict[str, Callable[[Job, int, int, dict[str, Any]], Any]] = {
     "local": run_here,
     "slurm": lambda *given: run_on_cluster(SlurmPipelineExecutor, *given),
     "ray": lambda *given: run_on_cluster(RayPipelineExecutor, *given),

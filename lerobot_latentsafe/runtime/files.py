@@ -36,6 +36,12 @@ def refuse_existing(path: str | Path, option: str = "--output_dir") -> None:
         raise FileExistsError(f"{path} exists already; choose another {option} or move it away")
 
 
+def refuse_filled(path: str | Path, option: str = "--output_dir") -> None:
+    """Raise FileExistsError if a folder could not be written: it is there, and not empty, or it is the present one."""
+    if not _is_empty(Path(path)) or Path(path) == Path.cwd():
+        refuse_existing(path, option)
+
+
 # -- whole or not at all ---
 
 
@@ -75,8 +81,7 @@ def replacing_folder(path: str | Path, option: str = "--output_dir") -> Iterator
     """
     path = Path(os.path.abspath(path))
     with locked_folder(path):
-        if not _is_empty(path) or path == Path.cwd():
-            refuse_existing(path, option)
+        refuse_filled(path, option)
         partial = _partial(path)
         try:
             yield partial
@@ -234,12 +239,13 @@ def _sync(path: Path) -> None:
 # -- one run a folder ---
 
 
-def claim(note: Path, options: dict) -> None:
+def claim(note: Path, options: dict, remedy: str = "choose another folder") -> None:
     """Note what a folder's run is, once; whoever goes on with it must want the same.
 
     Args:
         note: a file in that folder.
         options: JSON-able.
+        remedy: for whoever wants other options.
 
     Raises:
         OtherRunError: it is of a run with other options, which are named, or the note cannot be read.
@@ -253,7 +259,7 @@ def claim(note: Path, options: dict) -> None:
     if names:
         raise OtherRunError(
             f"{note.parent} holds a run with other options ({', '.join(names)}), which a resumed one would mix; give "
-            "the same options to go on with it, or choose another folder"
+            f"the same options to go on with it, or {remedy}"
         )
 
 
