@@ -27,6 +27,13 @@ record() { # name source seed
     --dataset.root="$DATA/$1" --seed="$3"
 }
 
+merge() { # name sources...
+  local name=$1 ids roots; shift
+  ids=$(printf "latentsafe/%s, " "$@") roots=$(printf "$DATA/%s, " "$@")
+  $BIN/lerobot-edit-dataset --operation.type=merge --new_repo_id="latentsafe/$name" --new_root="$DATA/$name" \
+    --operation.repo_ids="[${ids%, }]" --operation.roots="[${roots%, }]"
+}
+
 act() { # what it learns from
   [ -e "$OUT/act_$1/checkpoints/last" ] || timed "act_$1" $BIN/lerobot-train --config_path=configs/so101_act.yaml \
     --dataset.repo_id="latentsafe/so101_$1" --dataset.root="$DATA/so101_$1" --output_dir="$OUT/act_$1"
@@ -53,9 +60,7 @@ if [ "$WORLD_MODEL" = rssm ]; then
   act reckless
   act careful
 fi
-[ -e "$DATA/so101" ] || $BIN/lerobot-edit-dataset --operation.type=merge --new_repo_id=latentsafe/so101 \
-  --new_root="$DATA/so101" --operation.repo_ids="[latentsafe/so101_mix, latentsafe/so101_careful, latentsafe/so101_reckless]" \
-  --operation.roots="[$DATA/so101_mix, $DATA/so101_careful, $DATA/so101_reckless]"
+[ -e "$DATA/so101" ] || merge so101 so101_mix so101_careful so101_reckless
 [ -e "$CACHE" ] || timed cache $BIN/latentsafe cache --dataset.repo_id=latentsafe/so101 --dataset.root="$DATA/so101" \
   --output_dir="$CACHE" $PICTURES
 for seed in $SEEDS; do
@@ -64,6 +69,10 @@ done
 filters=$(for seed in $SEEDS; do echo "$OUT/filter_$seed"; done)
 if [ "$WORLD_MODEL" = dino_wm ]; then
   $BIN/python scripts/so101_operators.py --filters $filters
+  [ -e "$DATA/so101_mixed" ] || merge so101_mixed so101_careful so101_reckless
+  [ -e "$OUT/diffusion_mixed/checkpoints/last" ] || timed diffusion_mixed $BIN/lerobot-train \
+    --config_path=configs/so101_diffusion.yaml --dataset.root="$DATA/so101_mixed" --output_dir="$OUT/diffusion_mixed"
+  $BIN/python scripts/so101_policies.py --mixed="$OUT/diffusion_mixed/checkpoints/last/pretrained_model" --filters $filters --n=50
   exit 0
 fi
 
