@@ -44,17 +44,21 @@ def read_frames(root: str | Path, columns: Iterable[str] = ()) -> dict[str, np.n
         )
     with reading(files[0]):
         present = set(pq.ParquetFile(files[0]).schema_arrow.names)
-    wanted = ["index", "episode_index", *sorted(set(columns) & present)]
-    frames = [_read_columns(file, wanted) for file in files]
-    read = {name: _joined([part[name] for part in frames]) for name in wanted}
-    order = np.argsort(read["index"], kind="stable")
-    return {name: values[order] for name, values in read.items()}
+    order = np.argsort(_read_column(files, "index"), kind="stable")
+    # One after the other: of a large dataset each takes memory, and Arrow keeps what it has had.
+    read = {
+        name: _read_column(files, name)[order] for name in ("index", "episode_index", *sorted(set(columns) & present))
+    }
+    pa.default_memory_pool().release_unused()
+    return read
 
 
-def _read_columns(file: Path, names: list[str]) -> dict[str, np.ndarray]:
-    with reading(file):
-        table = pq.ParquetFile(file).read(columns=names)
-        return {name: to_numpy(table[name]) for name in names}
+def _read_column(files: list[Path], name: str) -> np.ndarray:
+    parts = []
+    for file in files:
+        with reading(file):
+            parts.append(to_numpy(pq.ParquetFile(file).read(columns=[name])[name]))
+    return _joined(parts)
 
 
 def _joined(parts: list[np.ndarray]) -> np.ndarray:
