@@ -94,7 +94,8 @@ class _ImageEncoder(nn.Module):
 
     def __init__(self, config: RSSMConfig):
         super().__init__()
-        if config.encoder == "mlp":
+        self.flat = config.encoder == "mlp"
+        if self.flat:
             self.dim = config.units
             pixels = 3 * config.image_size**2
             self.net = nn.Sequential(nn.Flatten(), mlp(pixels, config.units, config.image_layers))
@@ -107,7 +108,7 @@ class _ImageEncoder(nn.Module):
         self.net = nn.Sequential(*layers, nn.Flatten())
 
     def forward(self, images: Tensor) -> Tensor:
-        return self.net(images.contiguous(memory_format=torch.channels_last))
+        return self.net(images if self.flat else images.contiguous(memory_format=torch.channels_last))
 
 
 class _ImageDecoder(nn.Module):
