@@ -2,7 +2,7 @@
 """Policies push the cube with the SO-101, bare and under the same filters, from the same starts.
 
     scripts/so101_policies.py --reckless=<policy> --careful=<policy> --filters <filter> ... --n=100
-    scripts/so101_policies.py --mixed=<policy> --laws reachability nearest --filters <filter> ... --n=50
+    scripts/so101_policies.py --mixed=<policy> --laws guard reachability nearest --filters <filter> ... --n=50
 
 The first writes `bare` and `shielded` of the reckless one into results/so101/policies.json, as `latentsafe eval-shield`
 does, with the runs of all filters together; and the same under `reckless` and `careful`, with each filter's own. The
@@ -24,7 +24,8 @@ def main() -> None:
     parser.add_argument("--careful", help="policy that learnt to push to the mark")
     parser.add_argument("--mixed", help="policy that learnt from both")
     parser.add_argument("--filters", nargs="+", required=True)
-    parser.add_argument("--laws", nargs="+", default=["reachability", "nearest"], help="of the mixed policy's rows")
+    laws = ["guard", "reachability", "nearest"]
+    parser.add_argument("--laws", nargs="+", default=laws, help="of the mixed policy's rows")
     parser.add_argument("--n", type=int, default=100, help="starts")
     parser.add_argument("--law.name", dest="law", help="by default the filter's own; `margin` stops where l is low")
     parser.add_argument("--law.epsilon", dest="epsilon", type=float, help="by default the filter's own")

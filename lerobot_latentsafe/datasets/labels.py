@@ -44,11 +44,12 @@ def read_frames(root: str | Path, columns: Iterable[str] = ()) -> dict[str, np.n
         )
     with reading(files[0]):
         present = set(pq.ParquetFile(files[0]).schema_arrow.names)
-    order = np.argsort(_read_column(files, "index"), kind="stable")
+    index = _read_column(files, "index")
+    order = np.argsort(index, kind="stable")
+    read = {"index": index[order]}
     # One after the other: of a large dataset each takes memory, and Arrow keeps what it has had.
-    read = {
-        name: _read_column(files, name)[order] for name in ("index", "episode_index", *sorted(set(columns) & present))
-    }
+    for name in ("episode_index", *sorted(set(columns) & present - {"index"})):
+        read[name] = _read_column(files, name)[order]
     pa.default_memory_pool().release_unused()
     return read
 
