@@ -168,7 +168,7 @@ class _Conv(nn.Module):
         if before != after:
             x, before = F.pad(x, (before, after, before, after)), 0
         x = F.conv2d(x, self.weight, self.bias, self.stride, before, groups=self.groups)
-        return F.relu6(x) if self.act else x
+        return F.relu6(x, inplace=True) if self.act else x
 
 
 class _Block(nn.Module):
