@@ -6,6 +6,8 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from tiny import save_franka_filter
 
+from lerobot_latentsafe.cli.options import NewDataset
+from lerobot_latentsafe.cli.record import Collect
 from lerobot_latentsafe.collection import franka
 from lerobot_latentsafe.collection import parts as collection_parts
 from lerobot_latentsafe.collection.franka import SOURCES, Source
@@ -117,6 +119,47 @@ def test_starts_of_varied_bags_have_bags_of_their_own(source):
         looks = replace(bag, stiffness=Variant.stiffness, candy_mass=Variant.candy_mass, friction=Variant.friction)
         assert looks == Variant()
         assert bag.stiffness < VARIANTS["stiff"].stiffness and bag.candy_mass < VARIANTS["heavy"].candy_mass
+
+
+@pytest.mark.parametrize("source", [name for name, source in SOURCES.items() if source.speeds])
+def test_speeds_of_a_source_are_drawn_from_its_range_by_the_seed_alone(source, monkeypatch):
+    asked = []
+    config = franka.LatentSafeScriptedConfig
+    monkeypatch.setattr(
+        franka, "LatentSafeScriptedConfig", lambda **options: asked.append(options["speed"]) or config(**options)
+    )
+    with LatentSafeFrankaMujoco(LatentSafeFrankaMujocoConfig(image_size=32)) as robot:
+        for episode in (0, 1, 0):
+            next(franka.episode_frames(robot, SOURCES[source], episode, 3))
+    slowest, fastest = SOURCES[source].speeds
+    assert asked[0] == asked[2] != asked[1] and all(slowest <= speed <= fastest for speed in asked)
+
+
+def test_a_policy_of_the_users_own_acts_where_the_committed_ones_would(monkeypatch, tmp_path):
+    """And an unfinished recording of it goes on with it alone."""
+    acting = []
+
+    class Still:
+        begin = staticmethod(lambda seed: None)
+        act = staticmethod(lambda seen: dict.fromkeys(franka.ACTION_NAMES, 0.0))
+
+    monkeypatch.setattr(franka, "_policy_operator", lambda path, *rest: acting.append(path) or Still)
+    brief = replace(SOURCES["bag_policies"], seconds=0.2)
+    monkeypatch.setitem(SOURCES, "bag_policies", brief)
+    mine = collect("bag_policies", "me/mine", tmp_path / "mine", 3, seed=0, policy="outputs/mine")
+    assert acting == ["outputs/mine"] * 3 and mine.num_episodes == 3
+    monkeypatch.setattr(franka, "_record", lambda *args: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        collect("bag_policies", "me/mine", tmp_path / "cut", 3, seed=0, policy="outputs/mine")
+    for other in ("outputs/other", None):
+        with pytest.raises(ValueError, match="policy"):
+            collect("bag_policies", "me/mine", tmp_path / "cut", 3, seed=0, policy=other)
+
+
+@pytest.mark.parametrize("source", ["random", "so101_mix", "bag_mix", "blocks_demos"])
+def test_a_policy_is_refused_where_operators_act(source, tmp_path):
+    with pytest.raises(ValueError, match=f"no policy acts in {source}; expected --source=bag_policies or bag_shielded"):
+        Collect(source=source, dataset=NewDataset("me/mine", str(tmp_path / "mine")), policy="outputs/mine")
 
 
 def test_what_the_operator_of_a_pushed_hand_wants_is_recorded(tiny):

@@ -47,6 +47,7 @@ class Collect:
     - bag_shielded: the same policies, interrupted by a slow way down where the committed filter would override them
     - bag_retreats: whole lifts by either end and the middle, lowered slowly or stopped now and then
     - bag_pulls: the same lifts, undisturbed
+    - bag_swings: held by its closed end and swung, most of them too slowly to spill
     - bag_varied, bag_varied_pulls: lifts of bags that are stiffer or softer, heavier or lighter, rougher or smoother
     - bag_middle, bag_strong, bag_weak, bag_mixed: demonstrations; in the last three the hand is pushed aside at times
     - blocks_demos, blocks_random: the blocks
@@ -67,16 +68,21 @@ class Collect:
     """At one seed all sources start from the same scenes: where variety counts, give each its own."""
     workers: int = 1
     """Processes that record."""
+    policy: str | None = None
+    """Who acts in bag_policies and bag_shielded instead of the committed policies: a folder or a Hub id. Recordings of
+    the policy that a filter is to shield teach it where that one fails, and where it need not be interrupted."""
     tasks: Tasks = field(default_factory=Tasks)
 
     def __post_init__(self) -> None:
         require_at_least("--seed", self.seed, 0)
         require_at_least("--workers", self.workers, 1)
+        if self.policy is not None:
+            franka.require_policies(self.source)
 
     def run(self) -> None:
         """Record, and say how much."""
         if self.source in franka.SOURCES:
-            collect = partial(franka.collect_franka, workers=self.workers)
+            collect = partial(franka.collect_franka, workers=self.workers, policy=self.policy)
         elif self.source in dubins.SOURCES:
             collect = dubins.collect_dubins
         elif self.source in so101.SOURCES:

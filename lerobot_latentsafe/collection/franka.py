@@ -5,7 +5,7 @@ Episode i depends on the seed and i only.
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 
@@ -13,7 +13,13 @@ import numpy as np
 from lerobot.configs.video import RGBEncoderConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_latentsafe.collection.interventions import BRIEF, RETREATING, Interventions, InterventionStyle
+from lerobot_latentsafe.collection.interventions import (
+    BRIEF,
+    RARE,
+    RETREATING,
+    Interventions,
+    InterventionStyle,
+)
 from lerobot_latentsafe.collection.parts import record_in_parts
 from lerobot_latentsafe.collection.policy_operator import PolicyOperator
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE
@@ -44,6 +50,7 @@ class Source:
         branches: episodes that start from each grasped state; 0 records whole episodes from the start.
         grasps: of those states, the shares in which the bag is held by each of its segments, from its closed end on.
         clumsiness: of those grasps: 1 is off by a few millimetres.
+        speeds: slowest and fastest of the motion that matters, m/s; None: those that a behaviour is known for.
         astray: share of episodes that start with the arm astray instead of at home: demonstrations that all go straight
             to the bag never show a policy how to correct itself.
         pushed: standard deviation of the speed in m/s at which the hand is pushed now and then, and high up its fingers
@@ -62,6 +69,7 @@ class Source:
     branches: int = 0
     grasps: tuple[float, ...] = (0.6, 0, 0, 0.2, 0, 0, 0.2)
     clumsiness: float = 1.0
+    speeds: tuple[float, float] | None = None
     astray: float = 0.0
     pushed: float = 0.0
     policies: bool = False
@@ -100,6 +108,8 @@ SOURCES: dict[str, Source] = {
         "bag", {"open_end": 80, "middle": 30, "closed_end": 90}, astray=0.3, style=RETREATING, seconds=8.0
     ),
     "bag_pulls": Source("bag", {"open_end": 80, "middle": 30, "closed_end": 50, "side_to_side": 40}, astray=0.3),
+    # Most swing too slowly to spill: of fast ones the other recordings have enough.
+    "bag_swings": Source("bag", {"side_to_side": 120}, speeds=(0.05, 0.22), style=RARE),
     "bag_varied": Source(
         "bag", {"branch": 80, "climb": 80, "rise": 80}, varied=True, branches=2, grasps=(0.5, 0, 0, 0.1, 0, 0, 0.4)
     ),
@@ -134,24 +144,42 @@ def features(source: Source) -> dict:
 
 def collect_franka(
     name: str, repo_id: str, root: str | Path, n_episodes: int | None, seed: int, workers: int = 1,
-    tasks: Tasks | None = None,
+    tasks: Tasks | None = None, policy: str | None = None,
 ) -> LeRobotDataset | None:  # fmt: skip
     """Record a source, or go on recording it.
 
     Args:
         n_episodes: None takes the source's.
         workers: processes that record.
+        policy: path of the one that acts, instead of those of a source of policies.
 
     Returns, raises:
-        See `record_in_parts`; ValueError for an unknown source, too.
+        See `record_in_parts`; ValueError for an unknown source, too, and for a policy where operators act.
     """
     if name not in SOURCES:
         raise ValueError(f"--source is {name!r}; expected one of {', '.join(SOURCES)}")
     source = SOURCES[name]
+    if policy is not None:
+        require_policies(name)
     n = source.n_episodes if n_episodes is None else n_episodes
-    record = partial(_record, source, repo_id, seed)
     options = {"source": name, "repo_id": repo_id, "seed": seed}
+    if policy is not None:
+        source, options = replace(source, mix={policy: n}), {**options, "policy": policy}
+    record = partial(_record, source, repo_id, seed)
     return record_in_parts(repo_id, root, options, n, record, EPISODES_A_PART, workers, tasks)
+
+
+def require_policies(name: str) -> None:
+    """Refuse a policy where operators act.
+
+    Raises:
+        ValueError: naming the sources in which policies do.
+    """
+    of_policies = [known for known, source in SOURCES.items() if source.policies]
+    if name not in of_policies:
+        raise ValueError(
+            f"--policy was given, and no policy acts in {name}; expected --source={' or '.join(of_policies)}"
+        )
 
 
 def _record(source: Source, repo_id: str, seed: int, episodes: range, root: Path) -> Iterator[None]:
@@ -234,7 +262,10 @@ def _operator(
         operator.begin(robot.scene.seed)
         yield operator.act
         return
-    with LatentSafeScripted(LatentSafeScriptedConfig(behavior=behavior, seed=episode)) as scripted:
+    speed = None
+    if source.speeds is not None:
+        speed = float(np.random.default_rng([11, robot.scene.seed]).uniform(*source.speeds))
+    with LatentSafeScripted(LatentSafeScriptedConfig(behavior=behavior, speed=speed, seed=episode)) as scripted:
         if source.style is None:
             yield lambda seen: scripted.get_action()
             return

@@ -26,6 +26,8 @@ class InterventionStyle:
 
 
 BRIEF = InterventionStyle(chance=0.06, steps=(2, 13), down=0.6, speed=(0.2, 1.0))
+RARE = InterventionStyle(chance=0.012, steps=(4, 31), down=0.3, speed=(0.15, 0.5))
+"""About one an episode, most of which hold still."""
 RETREATING = InterventionStyle(chance=0.05, steps=(4, 41), down=0.7, speed=(0.15, 0.5))
 """Slow enough not to shake out what is held, and long enough to come down with it."""
 
