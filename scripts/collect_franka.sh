@@ -14,6 +14,8 @@ done
   --dataset.root="$OUT/bag_policies" --seed=23 --dataset.num_episodes=175
 [ -e "$OUT/bag_pulls" ] || .venv/bin/latentsafe collect --source=bag_pulls --dataset.repo_id=latentsafe/bag_pulls \
   --dataset.root="$OUT/bag_pulls" --seed=25
+[ -e "$OUT/bag_swings" ] || .venv/bin/latentsafe collect --source=bag_swings --dataset.repo_id=latentsafe/bag_swings \
+  --dataset.root="$OUT/bag_swings" --seed=53
 [ -e "$OUT/bag_retreats" ] || .venv/bin/latentsafe collect --source=bag_retreats --dataset.repo_id=latentsafe/bag_retreats \
   --dataset.root="$OUT/bag_retreats" --seed=31 --dataset.num_episodes=100
 # Interrupted where the committed filter would act.
