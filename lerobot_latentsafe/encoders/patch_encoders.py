@@ -145,7 +145,11 @@ class DinoEncoder(PatchEncoder):
 
 
 class _Conv(nn.Module):
-    """Convolution with its batch norm folded in, padded as TensorFlow pads, and ReLU6 if `act`."""
+    """Convolution with its batch norm folded in, padded as TensorFlow pads, and ReLU6 if `act`.
+
+    Of pictures turned by half a turn, with a kernel turned likewise: TensorFlow adds one more line behind a picture of
+    even size than before it, for which torch would copy the picture. Turned, that line is before it.
+    """
 
     weight: Tensor
     bias: Tensor
@@ -154,19 +158,15 @@ class _Conv(nn.Module):
         super().__init__()
         weight = weights[f"{conv}.weight"]
         scale = weights[f"{norm}.weight"].double() / (weights[f"{norm}.running_var"].double() + 1e-3).sqrt()
-        folded = (weight * scale[:, None, None, None]).float().contiguous(memory_format=torch.channels_last)
-        self.register_buffer("weight", folded)
+        folded = (weight * scale[:, None, None, None]).float().flip(-1, -2)
+        self.register_buffer("weight", folded.contiguous(memory_format=torch.channels_last))
         self.register_buffer("bias", (weights[f"{norm}.bias"] - weights[f"{norm}.running_mean"] * scale).float())
         self.stride, self.act = stride, act
         self.groups = len(weight) if weight.shape[1] == 1 else 1
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, C, S, S) -> (B, C', S', S')."""
-        kernel = self.weight.shape[-1]
-        missing = max((-(-x.shape[-1] // self.stride) - 1) * self.stride + kernel - x.shape[-1], 0)
-        before, after = missing // 2, missing - missing // 2
-        if before != after:
-            x, before = F.pad(x, (before, after, before, after)), 0
+        before = (self.weight.shape[-1] - 1) // 2
         x = F.conv2d(x, self.weight, self.bias, self.stride, before, groups=self.groups)
         return F.relu6(x, inplace=True) if self.act else x
 
@@ -208,8 +208,8 @@ class EfficientNetLite0(PatchEncoder):
 
     def see(self, images: Tensor) -> Seen:
         """What it says of normalised images (B, 3, S, S)."""
-        grid = self.net(images.contiguous(memory_format=torch.channels_last))
-        return Seen(grid.flatten(2).transpose(1, 2), None)
+        turned = images.flip(-1, -2).contiguous(memory_format=torch.channels_last)
+        return Seen(self.net(turned).flatten(2).flip(-1).transpose(1, 2), None)
 
 
 def load_bundled() -> EfficientNetLite0:
