@@ -9,6 +9,7 @@ V(z) = min(l(z), max_a Q(z, a)), where Q(z, a) is the value *after* a: Q(z, a) =
 import copy
 import math
 from collections.abc import Callable
+from itertools import chain
 from typing import Protocol
 
 import torch
@@ -265,13 +266,12 @@ class LatentReachability:
             loss = loss + config.hinge * self._hinge(self.succeeding)
         metrics = weight * torch.stack([critic_loss.detach(), target.mean()])
         self.optimizer.zero_grad(set_to_none=True)
-        received = self._backward(weight * loss, self.critic.q, metrics)
+        learning = [self._gradients(weight * loss, self.critic.q)]
         if self.critic.actor is not None:
             through_model = config.actor_through == "world_model"
             aim = self._imagined_value() if through_model else self._actor_objective(batch["x"])
-            # What the critic's gradients are on the other ranks comes meanwhile.
-            self._backward(-weight * aim, self.critic.actor)()
-        received()
+            learning.append(self._gradients(-weight * aim, self.critic.actor))
+        sum_over_ranks([*chain(*learning), metrics])
         self.optimizer.step()
         with torch.no_grad():
             for old, new in zip(self.target.parameters(), self.critic.parameters()):
@@ -283,11 +283,11 @@ class LatentReachability:
         return {"critic_loss": error, "gamma": gamma, "value": value}
 
     @staticmethod
-    def _backward(loss: Tensor, learner: nn.Module, *more: Tensor) -> Callable[[], None]:
-        """Gradients of one part of the critic; see `sum_over_ranks`."""
+    def _gradients(loss: Tensor, learner: nn.Module) -> list[Tensor]:
+        """Of one part of the critic, kept at its parameters."""
         parameters = list(learner.parameters())
         loss.backward(inputs=parameters)
-        return sum_over_ranks([p.grad for p in parameters] + list(more))
+        return [p.grad for p in parameters]
 
     def _cautious_loss(self, error: Tensor) -> Tensor:
         """Squared error in which an overestimate, a danger missed, weighs `caution` times an underestimate."""

@@ -104,20 +104,11 @@ def any_rank(flag: Tensor) -> bool:
     return bool(mean_over_ranks(flag) > 0)
 
 
-def sum_over_ranks(tensors: list[Tensor]) -> Callable[[], None]:
-    """Replace tensors of one type by their sums over ranks, all in one message, while this rank goes on computing.
-
-    Returns:
-        Waits for the sums: until it was called, nothing may read the tensors or write to them.
-    """
+def sum_over_ranks(tensors: list[Tensor]) -> None:
+    """Replace tensors of one type by their sums over ranks. One message for all: what it costs is that there is one."""
     if world_size() == 1:
-        return lambda: None
+        return
     flat = torch.cat([t.flatten() for t in tensors])
-    sent = dist.all_reduce(flat, async_op=True)
-
-    def receive() -> None:
-        sent.wait()
-        for tensor, total in zip(tensors, flat.split([t.numel() for t in tensors])):
-            tensor.copy_(total.view_as(tensor))
-
-    return receive
+    dist.all_reduce(flat)
+    for tensor, total in zip(tensors, flat.split([t.numel() for t in tensors])):
+        tensor.copy_(total.view_as(tensor))
