@@ -20,7 +20,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("outputs/demo_bag"))
     parser.add_argument("--policy", default="bag", help="the filter: a folder, a Hub id or a committed name")
     parser.add_argument("--base", help="a policy to be shielded, likewise")
-    parser.add_argument("--n", type=int, default=10, help="starts of the policy; operators get half as many")
+    parser.add_argument("--n", type=int, default=8, help="starts of the policy; operators get half as many")
     parser.add_argument("--encoder", help="train a filter that sees by it: dinov2, a folder, a Hub id, ...")
     sizes = FilterSizes()
     parser.add_argument("--episodes", type=int, default=sizes.episodes, help="recorded of each source")

@@ -21,7 +21,7 @@ from lerobot_latentsafe.runtime.locations import resolve_checkpoint
 
 MODULES = ("lerobot_latentsafe.registration", "lerobot_latentsafe.modeling_latentsafe", "lerobot.policies.factory")
 """What all commands import, but MuJoCo."""
-USUAL_MINUTES = {"policies": 2.7, "closed_end": 0.4, "open_end": 0.4}
+USUAL_MINUTES = {"policies": 2.3, "closed_end": 0.4, "open_end": 0.3}
 """Of CPU time, for the progress bar."""
 OPERATORS = {"closed_end": "pulls the closed end up", "open_end": "lifts the open end"}
 
