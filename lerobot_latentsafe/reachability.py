@@ -9,11 +9,10 @@ V(z) = min(l(z), max_a Q(z, a)), where Q(z, a) is the value *after* a: Q(z, a) =
 import copy
 import math
 from collections.abc import Callable
-from itertools import chain
 from typing import Protocol
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from lerobot_latentsafe.critic import HINGE_ABOVE, ReachabilityConfig, SafetyCritic, safety_bellman_target
 from lerobot_latentsafe.latent import Latent, map_latent, replace_rows, select
@@ -266,12 +265,13 @@ class LatentReachability:
             loss = loss + config.hinge * self._hinge(self.succeeding)
         metrics = weight * torch.stack([critic_loss.detach(), target.mean()])
         self.optimizer.zero_grad(set_to_none=True)
-        learning = [self._gradients(weight * loss, self.critic.q)]
+        (weight * loss).backward(inputs=list(self.critic.q.parameters()))
         if self.critic.actor is not None:
             through_model = config.actor_through == "world_model"
             aim = self._imagined_value() if through_model else self._actor_objective(batch["x"])
-            learning.append(self._gradients(-weight * aim, self.critic.actor))
-        sum_over_ranks([*chain(*learning), metrics])
+            (-weight * aim).backward(inputs=list(self.critic.actor.parameters()))
+        learned = [p for group in self.optimizer.param_groups for p in group["params"]]
+        sum_over_ranks([*(p.grad for p in learned), metrics])
         self.optimizer.step()
         with torch.no_grad():
             for old, new in zip(self.target.parameters(), self.critic.parameters()):
@@ -281,13 +281,6 @@ class LatentReachability:
         if not math.isfinite(error):
             raise FloatingPointError(f"critic loss is {error} at step {self.step_count}; lower --reachability.lr")
         return {"critic_loss": error, "gamma": gamma, "value": value}
-
-    @staticmethod
-    def _gradients(loss: Tensor, learner: nn.Module) -> list[Tensor]:
-        """Of one part of the critic, kept at its parameters."""
-        parameters = list(learner.parameters())
-        loss.backward(inputs=parameters)
-        return [p.grad for p in parameters]
 
     def _cautious_loss(self, error: Tensor) -> Tensor:
         """Squared error in which an overestimate, a danger missed, weighs `caution` times an underestimate."""

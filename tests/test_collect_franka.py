@@ -13,12 +13,14 @@ from lerobot_latentsafe.collection import parts as collection_parts
 from lerobot_latentsafe.collection.franka import SOURCES, Source
 from lerobot_latentsafe.collection.franka import collect_franka as collect
 from lerobot_latentsafe.collection.interventions import BRIEF, RETREATING, Interventions
+from lerobot_latentsafe.collection.policy_operator import check_policy
 from lerobot_latentsafe.collection.quiet import quiet_recording
 from lerobot_latentsafe.datasets.labels import FailureLabels
 from lerobot_latentsafe.franka.actions import action_limits
 from lerobot_latentsafe.franka.bag import VARIANTS, Variant
 from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
 from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
+from lerobot_latentsafe.runtime.locations import CheckpointError
 
 COLUMNS = ("observation.state", "action", "failure", "next.reward", "episode_index")
 
@@ -144,6 +146,7 @@ def test_a_policy_of_the_users_own_acts_where_the_committed_ones_would(monkeypat
         act = staticmethod(lambda seen: dict.fromkeys(franka.ACTION_NAMES, 0.0))
 
     monkeypatch.setattr(franka, "_policy_operator", lambda path, *rest: acting.append(path) or Still)
+    monkeypatch.setattr(franka, "check_policy", lambda *asked: None)
     brief = replace(SOURCES["bag_policies"], seconds=0.2)
     monkeypatch.setitem(SOURCES, "bag_policies", brief)
     mine = collect("bag_policies", "me/mine", tmp_path / "mine", 3, seed=0, policy="outputs/mine")
@@ -160,6 +163,26 @@ def test_a_policy_of_the_users_own_acts_where_the_committed_ones_would(monkeypat
 def test_a_policy_is_refused_where_operators_act(source, tmp_path):
     with pytest.raises(ValueError, match=f"no policy acts in {source}; expected --source=bag_policies or bag_shielded"):
         Collect(source=source, dataset=NewDataset("me/mine", str(tmp_path / "mine")), policy="outputs/mine")
+
+
+@pytest.mark.parametrize(
+    ("policy", "what"),
+    [
+        ("/nowhere", "no checkpoint at /nowhere"),
+        ("bag", "is itself a latentsafe filter"),
+        ("dubins_diffusion_careful", "cannot act on what the simulated Franka shows, which is observation.state"),
+        ("blocks_dreamer", "acts at 20 fps, the simulated robot at 15"),
+    ],
+)
+def test_a_policy_that_cannot_act_is_refused_before_anything_is_written(policy, what, tmp_path):
+    with pytest.raises((ValueError, CheckpointError), match=what):
+        collect("bag_policies", "me/mine", tmp_path / "mine", 1, seed=0, policy=policy)
+    assert not [*tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize("policy", [*SOURCES["bag_policies"].mix])
+def test_the_committed_policies_may_act(policy):
+    check_policy(policy, fps=15, image_size=224)
 
 
 def test_what_the_operator_of_a_pushed_hand_wants_is_recorded(tiny):

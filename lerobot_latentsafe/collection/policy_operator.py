@@ -24,6 +24,41 @@ OBSERVED = {
 """What a policy is given of an observation."""
 
 
+@torch.no_grad()
+def check_policy(path: str, fps: int, image_size: int) -> None:
+    """Refuse, before anything is recorded, a policy that cannot act here: it is asked about a black frame.
+
+    Args:
+        fps, image_size: of the robot, and of its square pictures.
+
+    Raises:
+        CheckpointError: there is none at this path; see `BasePolicy.load`.
+        ValueError: it is a filter, acts at another rate or in another action space, or fails.
+    """
+    policy = BasePolicy.load(path)
+    if policy.origin.fps not in (None, fps):
+        raise ValueError(
+            f"policy {path} acts at {policy.origin.fps} fps, the simulated robot at {fps}"
+        )
+    black = np.zeros((image_size, image_size, 3), np.uint8)
+    seen = {**dict.fromkeys(STATE_NAMES, 0.0), **dict.fromkeys(CAMERAS, black)}
+    try:
+        policy.reset()
+        action = policy.propose(_batch(seen))
+    except Exception as e:
+        raise ValueError(
+            f"policy {path} cannot act on what the simulated Franka shows, which is {', '.join(OBSERVED)} "
+            f"({type(e).__name__}: {e}). Give one that was trained on its recordings"
+        ) from e
+    if action.shape != (1, len(ACTION_NAMES)):
+        raise ValueError(f"policy {path} gives {action.shape[-1]} commands, expected {', '.join(ACTION_NAMES)}")
+
+
+def _batch(seen: Mapping[str, Any]) -> dict[str, torch.Tensor]:
+    """An observation of a LeRobot robot as policies take it."""
+    return prepare_observation_for_inference(build_dataset_frame(OBSERVED, seen, OBS_STR), torch.device("cpu"))
+
+
 class PolicyOperator:
     """Acts as a policy does in which somebody intervenes: what it does next it does in no other recording.
 
@@ -54,7 +89,7 @@ class PolicyOperator:
     @torch.no_grad()
     def act(self, seen: Mapping[str, Any]) -> dict[str, float]:
         """The action for an observation of a LeRobot robot, clipped into its limits."""
-        batch = prepare_observation_for_inference(build_dataset_frame(OBSERVED, seen, OBS_STR), torch.device("cpu"))
+        batch = _batch(seen)
         if self.filter is None:
             proposed, unsafe = self.policy.propose(batch), None
         else:

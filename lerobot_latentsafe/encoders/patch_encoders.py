@@ -147,8 +147,9 @@ class DinoEncoder(PatchEncoder):
 class _Conv(nn.Module):
     """Convolution with its batch norm folded in, padded as TensorFlow pads, and ReLU6 if `act`.
 
-    Of pictures turned by half a turn, with a kernel turned likewise: TensorFlow adds one more line behind a picture of
-    even size than before it, for which torch would copy the picture. Turned, that line is before it.
+    It takes pictures turned by half a turn, and turns its kernel likewise. TensorFlow adds one more line behind a
+    picture of even size than before it, for which torch would copy the picture; turned, that line comes first, and
+    torch adds it by itself.
     """
 
     weight: Tensor

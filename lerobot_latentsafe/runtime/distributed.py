@@ -105,7 +105,7 @@ def any_rank(flag: Tensor) -> bool:
 
 
 def sum_over_ranks(tensors: list[Tensor]) -> None:
-    """Replace tensors of one type by their sums over ranks. One message for all: what it costs is that there is one."""
+    """Replace tensors of one type by their sums over ranks, in one message, as each has a price."""
     if world_size() == 1:
         return
     flat = torch.cat([t.flatten() for t in tensors])
