@@ -2,6 +2,7 @@
 """A scripted operator lifts or swings the bag, bare and under filters and their baselines, from the same starts.
 
     scripts/bag_operators.py --filters <filter> ... --operators closed_end open_end --n=100
+    scripts/bag_operators.py --filters <filter> --laws reachability nearest --operators side_to_side_0.15 --n=15
 
 Writes results/bag/operators.json: for each operator bare, under each filter, and under the laws that the first one is
 compared with, the episodes that spill, the share of candies lost, steps overridden, the step of the first override, the

@@ -37,9 +37,7 @@ def check_policy(path: str, fps: int, image_size: int) -> None:
     """
     policy = BasePolicy.load(path)
     if policy.origin.fps not in (None, fps):
-        raise ValueError(
-            f"policy {path} acts at {policy.origin.fps} fps, the simulated robot at {fps}"
-        )
+        raise ValueError(f"policy {path} acts at {policy.origin.fps} fps, the simulated robot at {fps}")
     black = np.zeros((image_size, image_size, 3), np.uint8)
     seen = {**dict.fromkeys(STATE_NAMES, 0.0), **dict.fromkeys(CAMERAS, black)}
     try:
