@@ -13,7 +13,6 @@ each run, and minutes at full size.
 import argparse
 import json
 import os
-import resource
 import shutil
 import subprocess
 import sys
@@ -36,19 +35,19 @@ def cpu_seconds(checkout: Path, log: Path, *command: str) -> float:
         SystemExit: it failed; with the end of its output.
     """
     environment = {**os.environ, "PYTHONPATH": str(checkout), "OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1"}
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    before = os.times()
     with log.open("a") as stream:
         program = [str(BIN / command[0]), *command[1:]]
         code = subprocess.run(program, cwd=checkout, env=environment, stdout=stream, stderr=stream).returncode
     if code:
         raise SystemExit(f"{' '.join(command)} failed in {checkout}; the end of its output:\n{log.read_text()[-2000:]}")
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    after = os.times()
+    return after.children_user + after.children_system - before.children_user - before.children_system
 
 
 def seconds_of_steps(checkout: Path, dataset: Path, work: Path) -> dict[str, list[float]]:
     """Step of the recipe -> CPU seconds at each of its sizes."""
-    log, cached = work / "log", f"--dataset.root={work}/{EPISODES[1]}"
+    log, cache = work / "log", work / str(EPISODES[1])
     timed: dict[str, list[float]] = {"cache": [], "world model": [], "margin": [], "reachability": []}
 
     def run(step: str, *command: str) -> None:
@@ -59,28 +58,16 @@ def seconds_of_steps(checkout: Path, dataset: Path, work: Path) -> dict[str, lis
         some = f"--dataset.episodes={json.dumps([*range(n)])}"
         source = ("--dataset.repo_id=me/bag", f"--dataset.root={dataset}", some)
         run("cache", "latentsafe", "cache", "--encoder=efficientnet_lite0", *source, f"--output_dir={work}/{n}")
+    of_cache = ("--dataset.repo_id=me/bag", f"--dataset.root={cache}")
     for n in STEPS:
         shutil.rmtree(work / "wm", ignore_errors=True)
-        how = (
-            f"--steps={n}",
-            f"--save_freq={n}",
-            f"--output_dir={work}/wm",
-            f"--policy.frame_cache={work}/{EPISODES[1]}",
-        )
-        run(
-            "world model",
-            "lerobot-train",
-            "--config_path=configs/bag_gru.yaml",
-            "--dataset.repo_id=me/bag",
-            cached,
-            *how,
-        )
+        how = (f"--steps={n}", f"--save_freq={n}", f"--output_dir={work}/wm", f"--policy.frame_cache={cache}")
+        run("world model", "lerobot-train", "--config_path=configs/bag_gru.yaml", *of_cache, *how)
     trained = f"--policy.path={work}/wm/checkpoints/last/pretrained_model"
-    cached = (cached, "--dataset.repo_id=me/bag")
-    run("margin", "latentsafe", "train-margin", trained, *cached, f"--output_dir={work}/margin")
+    run("margin", "latentsafe", "train-margin", trained, *of_cache, f"--output_dir={work}/margin")
     for n in CRITIC_STEPS:
         how = (f"--policy.path={work}/margin", f"--steps={n}", f"--output_dir={work}/filter_{n}")
-        run("reachability", "latentsafe", "train-reachability", *how, *cached)
+        run("reachability", "latentsafe", "train-reachability", *how, *of_cache)
     return timed
 
 
