@@ -13,9 +13,9 @@ each run, and minutes at full size.
 import argparse
 import json
 import os
-import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -45,29 +45,36 @@ def cpu_seconds(checkout: Path, log: Path, *command: str) -> float:
     return after.children_user + after.children_system - before.children_user - before.children_system
 
 
-def seconds_of_steps(checkout: Path, dataset: Path, work: Path) -> dict[str, list[float]]:
-    """Step of the recipe -> CPU seconds at each of its sizes."""
-    log, cache = work / "log", work / str(EPISODES[1])
-    timed: dict[str, list[float]] = {"cache": [], "world model": [], "margin": [], "reachability": []}
-
-    def run(step: str, *command: str) -> None:
-        timed[step].append(cpu_seconds(checkout, log, *command))
-        print(f"{checkout.name} {step}: {timed[step][-1]:.1f} CPU-seconds", flush=True)
-
+def commands(dataset: Path, work: Path) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """The steps of the recipe, each at its sizes, in order: its name and its command."""
+    cache = work / str(EPISODES[1])
     for n in EPISODES:
         some = f"--dataset.episodes={json.dumps([*range(n)])}"
         source = ("--dataset.repo_id=me/bag", f"--dataset.root={dataset}", some)
-        run("cache", "latentsafe", "cache", "--encoder=efficientnet_lite0", *source, f"--output_dir={work}/{n}")
+        yield "cache", ("latentsafe", "cache", "--encoder=efficientnet_lite0", *source, f"--output_dir={work}/{n}")
     of_cache = ("--dataset.repo_id=me/bag", f"--dataset.root={cache}")
     for n in STEPS:
-        shutil.rmtree(work / "wm", ignore_errors=True)
-        how = (f"--steps={n}", f"--save_freq={n}", f"--output_dir={work}/wm", f"--policy.frame_cache={cache}")
-        run("world model", "lerobot-train", "--config_path=configs/bag_gru.yaml", *of_cache, *how)
-    trained = f"--policy.path={work}/wm/checkpoints/last/pretrained_model"
-    run("margin", "latentsafe", "train-margin", trained, *of_cache, f"--output_dir={work}/margin")
+        how = (f"--steps={n}", f"--save_freq={n}", f"--output_dir={work}/wm_{n}", f"--policy.frame_cache={cache}")
+        yield "world model", ("lerobot-train", "--config_path=configs/bag_gru.yaml", *of_cache, *how)
+    trained = f"--policy.path={work}/wm_{STEPS[1]}/checkpoints/last/pretrained_model"
+    yield "margin", ("latentsafe", "train-margin", trained, *of_cache, f"--output_dir={work}/margin")
     for n in CRITIC_STEPS:
         how = (f"--policy.path={work}/margin", f"--steps={n}", f"--output_dir={work}/filter_{n}")
-        run("reachability", "latentsafe", "train-reachability", *how, *of_cache)
+        yield "reachability", ("latentsafe", "train-reachability", *how, *of_cache)
+
+
+def seconds_in_turn(checkouts: dict[str, Path], dataset: Path) -> dict[str, dict[str, list[float]]]:
+    """Checkout -> step of the recipe -> CPU seconds at each of its sizes. At each step all take their turn."""
+    timed: dict[str, dict[str, list[float]]] = {name: {} for name in checkouts}
+    with TemporaryDirectory() as folder:
+        works = {name: Path(folder) / name for name in checkouts}
+        for work in works.values():
+            work.mkdir()
+        for turn in zip(*(commands(dataset, work) for work in works.values()), strict=True):
+            for (name, checkout), (step, command) in zip(checkouts.items(), turn):
+                took = cpu_seconds(checkout, works[name] / "log", *command)
+                timed[name].setdefault(step, []).append(took)
+                print(f"{name} {step}: {took:.1f} CPU-seconds", flush=True)
     return timed
 
 
@@ -101,23 +108,20 @@ def main() -> None:
     a_frame = length["total_frames"] / length["total_episodes"]
     frames = (round(EPISODES[0] * a_frame), round(EPISODES[1] * a_frame))
     checkouts = {"before": arguments.before.absolute(), "now": HERE}
-    rounds: list[dict[str, dict]] = []
+    rounds = []
     for _ in range(arguments.rounds):
-        rounds.append({})
-        for name, checkout in checkouts.items():
-            with TemporaryDirectory() as folder:
-                timed = seconds_of_steps(checkout, dataset, Path(folder))
-            minutes = at_full_size(timed, checkout, arguments.frames, frames)
-            rounds[-1][name] = {"seconds": timed, "minutes": minutes}
-            print(name, {step: round(value, 1) for step, value in minutes.items()}, flush=True)
+        timed = seconds_in_turn(checkouts, dataset)
+        minutes = {name: at_full_size(timed[name], at, arguments.frames, frames) for name, at in checkouts.items()}
+        rounds.append({name: {"seconds": timed[name], "minutes": minutes[name]} for name in checkouts})
+        print(minutes, flush=True)
     ratios = [row["now"]["minutes"]["all"] / row["before"]["minutes"]["all"] for row in rounds]
     print("now, against before:", ratios)
-    minutes = sum(sum(seconds) for row in rounds for of in row.values() for seconds in of["seconds"].values()) / 60
+    spent = sum(sum(seconds) for row in rounds for of in row.values() for seconds in of["seconds"].values()) / 60
     settings = {
         "frames": arguments.frames,
         "sizes": {"cache": frames, "world model": STEPS, "reachability": CRITIC_STEPS},
     }
-    write_json(arguments.output, {"rounds": rounds, "now_over_before": ratios, **settings, **provenance([0], minutes)})
+    write_json(arguments.output, {"rounds": rounds, "now_over_before": ratios, **settings, **provenance([0], spent)})
 
 
 if __name__ == "__main__":
