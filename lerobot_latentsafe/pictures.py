@@ -26,9 +26,13 @@ def to_model_images(images: Tensor, size: int) -> Tensor:
 
 
 def averaged(images: Tensor, size: int) -> Tensor:
-    """Float pictures (..., H, W), area-averaged to (..., size, size)."""
+    """Float pictures (..., C, H, W), area-averaged to (..., C, size, size); colours stay last in memory if they are."""
     if images.shape[-2:] == (size, size):
         return images
+    pixels = images.movedim(-3, -1)
+    if pixels.is_contiguous():  # as cameras and videos give them: long lines, of which few products are made
+        rows = _averaged_rows(pixels.flatten(-2), size)
+        return _averaged_colours(rows.unflatten(-1, pixels.shape[-2:]), size).movedim(-1, -3)
     return _averaged_rows(_averaged_rows(images, size).mT, size).mT
 
 
@@ -42,14 +46,23 @@ def _averaged_rows(images: Tensor, size: int) -> Tensor:
     return (_averages(parts.shape[-2], size // n_parts).to(images) @ parts).flatten(-3, -2)
 
 
+def _averaged_colours(pixels: Tensor, size: int) -> Tensor:
+    """Lines of colours (..., W, C), averaged to (..., size, C), in parts likewise."""
+    n_parts, colours = math.gcd(pixels.shape[-2], size), pixels.shape[-1]
+    parts = pixels.unflatten(-2, (n_parts, -1)).flatten(-2)
+    weights = _averages(pixels.shape[-2] // n_parts, size // n_parts, colours).to(pixels)
+    return (parts @ weights.mT).flatten(-2).unflatten(-1, (size, colours))
+
+
 @functools.cache
-def _averages(n: int, size: int) -> Tensor:
-    """(size, n): averages of a line's numbers over equal parts, as in interpolation by area, which is slower."""
+def _averages(n: int, size: int, colours: int = 1) -> Tensor:
+    """(size, n), each times the colours: averages of a line's numbers over equal parts, as in interpolation by area,
+    which is slower."""
     weights = torch.zeros(size, n)
     for i in range(size):
         first, end = i * n // size, -(-(i + 1) * n // size)
         weights[i, first:end] = 1 / (end - first)
-    return weights
+    return torch.kron(weights, torch.eye(colours))
 
 
 def surely_colours(pictures: Tensor) -> bool:
