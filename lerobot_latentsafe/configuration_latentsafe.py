@@ -6,8 +6,10 @@ from typing import Any
 
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import NormalizationMode
-from lerobot.optim import AdamConfig, CosineDecayWithWarmupSchedulerConfig
+from lerobot.optim import AdamConfig, CosineDecayWithWarmupSchedulerConfig, OptimizerConfig
+from lerobot.optim.optimizers import OptimizerParams
 from lerobot.utils.constants import HF_LEROBOT_HOME
+from torch.optim import Adam
 
 from lerobot_latentsafe._compat import training_run
 from lerobot_latentsafe.constraints import LikenessConfig
@@ -34,6 +36,16 @@ SEALED_ENTRIES = (
 
 class CriticTargetError(ValueError):
     """A critic is asked for what it was not trained to say: a risk read as a safety value, or the reverse."""
+
+
+@OptimizerConfig.register_subclass("latentsafe_adam")
+@dataclass
+class FusedAdamConfig(AdamConfig):
+    """Adam that takes a step in one pass over the weights: torch's default takes several, five times as long here."""
+
+    def build(self, params: OptimizerParams) -> Adam:
+        """The optimizer of these parameters."""
+        return Adam(params, self.lr, self.betas, self.eps, self.weight_decay, fused=True)
 
 
 @PreTrainedConfig.register_subclass("latentsafe")
@@ -155,7 +167,7 @@ class LatentSafeConfig(PreTrainedConfig):
         """No rewards are read."""
         return None
 
-    def get_optimizer_preset(self) -> AdamConfig:
+    def get_optimizer_preset(self) -> FusedAdamConfig:
         """Adam, as lerobot-train asks for it: the last time that it asks a policy before it opens the dataset.
 
         Raises:
@@ -165,7 +177,7 @@ class LatentSafeConfig(PreTrainedConfig):
         folder = None if run is None else run.dataset.root or HF_LEROBOT_HOME / str(run.dataset.repo_id)
         if folder is not None and (run.dataset.root or Path(folder).exists()):
             check_for_lerobot(Path(folder), run.dataset.use_imagenet_stats)
-        return AdamConfig(lr=self.optimizer_lr, weight_decay=0.0, grad_clip_norm=self.grad_clip_norm)
+        return FusedAdamConfig(lr=self.optimizer_lr, weight_decay=0.0, grad_clip_norm=self.grad_clip_norm)
 
     def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
         """Cosine decay to a twentieth after 100 steps of warm-up."""

@@ -111,15 +111,14 @@ class LatentSafePolicy(PreTrainedPolicy):
         return [*untrained, *(name for name, _ in self.named_buffers())]
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
-        """World-model loss plus the weighted hinge loss of the margin (Eq. 3)."""
+        """World-model loss plus the weighted hinge loss of the margin (Eq. 3), in mixed precision under autocast."""
         if self.reader is None:
             raise UntrainedFilterError(
                 "forward needs the dataset's labels: build the policy through lerobot-train or make_policy(ds_meta=...)"
             )
         if self.model.device.type == "cpu":
             keep_freed_memory()
-        with self.model.single_precision():
-            loss, _, metrics = self.model.clip_loss(self.reader.read(batch, self.model))
+        loss, _, metrics = self.model.clip_loss(self.reader.read(batch, self.model))
         told = torch.stack([torch.as_tensor(value, device=loss.device).float() for value in metrics.values()])
         return loss, dict(zip(metrics, told.tolist()))  # a GPU is waited for once
 

@@ -1,8 +1,11 @@
 import json
+import os
 
 import pytest
+import torch
 
 from lerobot_latentsafe.evaluation.statistics import wilson
+from lerobot_latentsafe.experiments import demo as steps
 from lerobot_latentsafe.experiments.dubins import demo
 
 
@@ -49,3 +52,18 @@ def test_the_bar_knows_all_steps(tmp_path, monkeypatch):
     assert set(ran) == set(demo.USUAL_MINUTES)
     seeded = {step for step, command in ran.items() if {"--seed=7", "--seeds=[7]"} & set(command)}
     assert {step for step in ran if step.split()[0] in ("collect", "train", "fit", "reachability")} == seeded
+
+
+def test_a_command_may_have_a_variable_of_its_environment_before_it(tmp_path, capfd):
+    script = tmp_path / "script.py"
+    script.write_text("import os; print('precision is', os.environ['ACCELERATE_MIXED_PRECISION'])")
+    shown = steps.Demo(tmp_path / "demo")
+    shown.run("train", *steps.MIXED_PRECISION, "python", str(script))
+    assert "precision is bf16" in (tmp_path / "demo/logs/train.log").read_text()
+    assert "ACCELERATE_MIXED_PRECISION" not in os.environ
+
+
+@pytest.mark.parametrize("able", [{}, {"avx512_bf16": True}, {"amx_bf16": True}])
+def test_16_bits_are_for_processors_that_are_quick_at_them(able, monkeypatch):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: able)
+    assert steps.in_16_bits() == (steps.MIXED_PRECISION if able else ())

@@ -70,16 +70,28 @@ def test_under_autocast_a_base_policy_runs_mixed_and_is_judged_in_single_precisi
     assert not any(decision.reason.eq(Reason.BASE_POLICY_FAILED).any() for decision in decisions)
 
 
-def test_it_trains_alike_under_autocast(cache_meta):
-    losses = []
+@pytest.mark.parametrize("kind", ["rssm", "categorical rssm", "gru", "dino_wm"])
+def test_it_trains_in_mixed_precision_under_autocast(kind, cache_meta, token_root):
+    """As lerobot-train asks for by --policy.use_amp=true, and accelerate by --mixed_precision=bf16."""
+    changes = {
+        "rssm": {}, "categorical rssm": {"world_model": tiny.rssm_config(classes=4)},
+        "gru": {"world_model": tiny.gru_config()}, "dino_wm": {"world_model": tiny.dino_wm_config()},
+    }[kind]  # fmt: skip
+    losses, slopes = [], []
     for mixed in (False, True):
         torch.manual_seed(0)
-        policy = tiny.new_policy(cache_meta).train()
+        meta = cache_meta if "rssm" in kind else tiny.metadata(token_root)
+        policy = tiny.new_policy(meta, **changes).train()
         with torch.autocast("cpu", dtype=torch.bfloat16, enabled=mixed):
+            torch.manual_seed(1)
             loss, _ = policy.forward({"index": torch.arange(8)})
         loss.backward()
         losses.append(loss)
-    assert torch.equal(*losses)
+        slopes.append(torch.cat([p.grad.flatten() for p in policy.get_optim_params() if p.grad is not None]))
+    assert losses[1].dtype == torch.float32
+    assert not torch.equal(*losses)
+    torch.testing.assert_close(losses[1], losses[0], rtol=0.05, atol=0)
+    assert torch.nn.functional.cosine_similarity(*slopes, dim=0) > 0.95
 
 
 @pytest.mark.parametrize(

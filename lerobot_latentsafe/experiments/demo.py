@@ -12,11 +12,14 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 import psutil
+import torch
 
 from lerobot_latentsafe.reports import html
 
 SIDE_BY_SIDE = "bare | shielded; orange: the filter acts"
 NO_GUARANTEE = "A learned filter is not a certified safety device: it carries no guarantee."
+MIXED_PRECISION = ("env", "ACCELERATE_MIXED_PRECISION=bf16")
+"""Before lerobot-train: large products in 16 bits, as `accelerate launch --mixed_precision=bf16` would have them."""
 ENVIRONMENT = {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", "TQDM_DISABLE": "1", "DIFFUSERS_VERBOSITY": "error"}
 STARTING = "starting Python and LeRobot, once"
 
@@ -116,14 +119,24 @@ def run_command(log: Path, *command: str) -> float | None:
 
 
 def _run(program: str, *options: str) -> None:
-    """What a shell would start: a script, or an installed command."""
+    """What a shell would start: a script, or an installed command, with a variable of its environment before it."""
     if program == "python":
         sys.argv = list(options)
         runpy.run_path(options[0], run_name="__main__")
+    elif program == "env":
+        setting, *command = options
+        os.environ.update([setting.split("=", 1)])
+        _run(*command)
     else:
         sys.argv = [program, *options]
         (entry,) = entry_points(group="console_scripts", name=program)
         entry.load()()
+
+
+def in_16_bits() -> tuple[str, ...]:
+    """What to put before a training command where the processor multiplies 16-bit numbers faster than 32-bit ones."""
+    able = torch.cpu.get_capabilities()
+    return MIXED_PRECISION if able.get("avx512_bf16") or able.get("amx_bf16") else ()
 
 
 def parent_minutes() -> float:

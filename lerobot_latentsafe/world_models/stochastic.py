@@ -1,6 +1,7 @@
 """What the stochastic part x of an RSSM can be: Gaussians (Hafner et al., 2019) or categoricals (DreamerV3).
 
-A network's raw output (..., n_raw) is read into statistics, a tuple of tensors, which all else is a function of.
+A network's raw output (..., n_raw) is read into statistics, a tuple of tensors, which all else is a function of: in
+single precision, also where the network computes in 16 bits.
 """
 
 import torch
@@ -19,7 +20,7 @@ class Gaussian:
 
     def read(self, raw: Tensor) -> Statistics:
         """Raw output (..., n_raw) -> statistics."""
-        mean, std = raw.chunk(2, -1)
+        mean, std = raw.float().chunk(2, -1)
         return mean, 2 * torch.sigmoid(std / 2) + self.min_std
 
     def centre(self, statistics: Statistics) -> Tensor:
@@ -50,7 +51,7 @@ class Categorical:
 
     def read(self, raw: Tensor) -> Statistics:
         """Raw output (..., n_raw) -> statistics."""
-        probabilities = raw.unflatten(-1, (self.size, self.classes)).softmax(-1)
+        probabilities = raw.float().unflatten(-1, (self.size, self.classes)).softmax(-1)
         return ((1 - self.unimix) * probabilities + self.unimix / self.classes,)
 
     def centre(self, statistics: Statistics) -> Tensor:

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from statistics import mean
@@ -15,6 +16,7 @@ from lerobot_latentsafe.experiments.demo import (
     SIDE_BY_SIDE,
     Demo,
     durations,
+    in_16_bits,
     told,
     where_the_minutes_went,
 )
@@ -79,13 +81,19 @@ class DubinsDemo(Demo):
         )
         return f"{root}_cache"
 
-    def train(self, what: str, config: str, source: str, root: str, *options: str) -> str:
-        """Train by lerobot-train; returns the last checkpoint's folder."""
+    def train(self, what: str, config: str, source: str, root: str, *options: str, before: Sequence[str] = ()) -> str:
+        """Train by lerobot-train, with something before the command; returns the last checkpoint's folder."""
         folder = self.out / f"train_{source}"
         self.run(
             f"train {what}",
-            *("lerobot-train", f"--config_path=configs/{config}.yaml", f"--dataset.repo_id=demo/{source}_cache"),
-            *(f"--dataset.root={root}", f"--output_dir={folder}", f"--seed={self.seed}", *options),
+            *(*before, "lerobot-train", f"--config_path=configs/{config}.yaml"),
+            *(
+                f"--dataset.repo_id=demo/{source}_cache",
+                f"--dataset.root={root}",
+                f"--output_dir={folder}",
+                f"--seed={self.seed}",
+                *options,
+            ),
         )
         return str(folder / "checkpoints" / "last" / "pretrained_model")
 
@@ -96,7 +104,7 @@ class DubinsDemo(Demo):
         checkpoint = self.train(
             "world model", "dubins_rssm", "random", root, f"--policy.frame_cache={root}",
             f"--policy.fallback.action_candidates={CANDIDATES}", f"--steps={WORLD_MODEL_STEPS}",
-            f"--policy.scheduler_steps={WORLD_MODEL_STEPS}", *FEW,
+            f"--policy.scheduler_steps={WORLD_MODEL_STEPS}", *FEW, before=in_16_bits(),
         )  # fmt: skip
         self.run(  # anew, for that one tells a sure margin from a surer one, by which a fallback is chosen
             "fit the failure margin",
