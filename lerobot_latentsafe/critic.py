@@ -102,6 +102,9 @@ class ReachabilityConfig:
         caution: weight of overestimates of V in the squared error, relative to underestimates.
         hinge: weight of a one-sided hinge on V, which should be above `HINGE_ABOVE` where recorded episodes went on to
             succeed, by their column next.success. It keeps the filter from stopping what is known to go well.
+        local_updates: updates that each of several processes makes by itself before their weights are averaged (local
+            SGD, Stich 2019), which saves most of the waiting. 1: gradients are summed at each, and together the
+            processes learn what one would.
         tau: rate of the target network.
         pool: imagined states kept; a part is imagined anew every `refresh` steps.
         greedy: share of imagined trajectories that follow the current fallback policy, which lets imagination visit
@@ -127,6 +130,7 @@ class ReachabilityConfig:
     anneal: float = 0.26
     caution: float = 2.0
     hinge: float = 0.0
+    local_updates: int = 1
     tau: float = 0.05
     pool: int = 131_072
     refresh: int = 250
@@ -144,6 +148,8 @@ class ReachabilityConfig:
             raise ValueError(f"actor_through is {self.actor_through!r}; expected critic or world_model")
         if not 0 <= self.hinge < math.inf:
             raise ValueError(f"--policy.reachability.hinge is {self.hinge}; expected a weight, 0 or more")
+        if self.local_updates < 1:
+            raise ValueError(f"--policy.reachability.local_updates is {self.local_updates}; expected at least 1")
 
 
 HINGE_ABOVE = 0.3

@@ -16,7 +16,14 @@ from torch import Tensor
 
 from lerobot_latentsafe.critic import HINGE_ABOVE, ReachabilityConfig, SafetyCritic, safety_bellman_target
 from lerobot_latentsafe.latent import Latent, map_latent, replace_rows, select
-from lerobot_latentsafe.runtime.distributed import any_rank, from_first_rank, gathered, share, sum_over_ranks
+from lerobot_latentsafe.runtime.distributed import (
+    any_rank,
+    average_over_ranks,
+    from_first_rank,
+    gathered,
+    share,
+    sum_over_ranks,
+)
 
 Starts = Callable[[int], Latent]
 """Draws a batch of latents from which imagination starts: encoded dataset windows. Of several ranks, each gets its
@@ -106,7 +113,8 @@ class LatentReachability:
     With discrete actions the successors under *all* actions are imagined, so each update backs up every action.
 
     Several ranks learn what one learns: they make the same draws, of which each imagines and backs up its share. What
-    they imagine is gathered in the pool of each, and gradients are summed.
+    they imagine is gathered in the pool of each, and gradients are summed. With `local_updates`, each follows its own
+    gradient for so many updates, after which their weights are averaged.
 
     Args:
         succeeding: (M, D), features of latents from which a recorded episode went on to succeed, for the hinge.
@@ -256,7 +264,8 @@ class LatentReachability:
             self._refresh_pool()
         gamma = discount(progress, config)
         picked = self._draw(torch.randint, len(self.pool["choice"]), (config.batch_size,))
-        weight = len(picked) / config.batch_size  # of this rank's means
+        together = config.local_updates == 1
+        weight = len(picked) / config.batch_size if together else 1.0  # of this rank's means
         batch = {key: value[picked] for key, value in self.pool.items()}
         target = self._td_target(batch, gamma)
         critic_loss = self._cautious_loss(self._predict(batch) - target)
@@ -271,12 +280,15 @@ class LatentReachability:
             aim = self._imagined_value() if through_model else self._actor_objective(batch["x"])
             (-weight * aim).backward(inputs=list(self.critic.actor.parameters()))
         learned = [p for group in self.optimizer.param_groups for p in group["params"]]
-        sum_over_ranks([*(p.grad for p in learned), metrics])
+        if together:
+            sum_over_ranks([*(p.grad for p in learned), metrics])
         self.optimizer.step()
         with torch.no_grad():
             for old, new in zip(self.target.parameters(), self.critic.parameters()):
                 old.lerp_(new, config.tau)
         self.step_count += 1
+        if not together and (self.step_count % config.local_updates == 0 or self.step_count == config.steps):
+            average_over_ranks([*learned, *self.target.parameters(), metrics])
         error, value = metrics.tolist()
         if not math.isfinite(error):
             raise FloatingPointError(f"critic loss is {error} at step {self.step_count}; lower --reachability.lr")

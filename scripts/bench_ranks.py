@@ -4,8 +4,8 @@
     world_model     gradient steps on clips from a token cache, with DistributedDataParallel as LeRobot sets it up
     reachability    `refresh` updates of the critic and the imagination of a part of its pool, as in
                     `latentsafe train-reachability`; two ranks have a batch and a pool of twice the size. With the
-                    batch of the configuration, and with one of 2048 states a rank: an update is over in a few
-                    milliseconds, and gradients must travel after each
+                    batch of the configuration, with one of 2048 states a rank, and with weights that are averaged
+                    after every 8 updates: an update is over in a few milliseconds, and gradients must travel after each
 
 Three teams wait in processes of their own and work in turn: one process alone; two ranks of gloo; and, as the ceiling
 that this machine sets (shared caches, memory and clock), two processes that know nothing of each other. What counts is

@@ -47,10 +47,10 @@ def train_world_model(root, name):
     return {"losses": torch.stack(losses), **weights}
 
 
-def learn_reachability(root, actions):
+def learn_reachability(root, actions, **changes):
     """Losses, weights and starts of a few updates, with batches and chunks of imagination that two do not divide."""
     torch.manual_seed(0)
-    sizes = tiny.reachability_config(batch_size=33, pool=516, refresh=5)
+    sizes = tiny.reachability_config(batch_size=33, pool=516, refresh=5, **changes)
     policy = tiny.new_policy(
         tiny.metadata(root), fallback_action_candidates=ACTIONS[actions], reachability=sizes
     ).eval()
@@ -66,7 +66,10 @@ def learn_reachability(root, actions):
 def everything(car_cache, car_tokens):
     roots = {"rssm": car_cache, "gru": car_tokens, "dino_wm": car_tokens}
     found = {name: train_world_model(roots[name], name) for name in WORLD_MODELS}
-    return found | {actions: learn_reachability(car_cache, actions) for actions in ACTIONS}
+    for actions in ACTIONS:
+        found[actions] = learn_reachability(car_cache, actions)
+        found[f"{actions}, apart"] = learn_reachability(car_cache, actions, local_updates=4)
+    return found
 
 
 def _rank(rank, folder, roots):
@@ -94,6 +97,19 @@ def test_two_ranks_train_what_one_does(one, two, name):
         assert rank[name].keys() == one[name].keys()
         for key, value in one[name].items():
             torch.testing.assert_close(rank[name][key], value, rtol=1e-3, atol=2e-5, msg=lambda m, k=key: f"{k}: {m}")
+
+
+@pytest.mark.parametrize("actions", ACTIONS)
+def test_two_ranks_that_update_apart_agree_in_the_end_on_about_what_one_learns(one, two, actions):
+    apart, (first, second) = f"{actions}, apart", (rank[f"{actions}, apart"] for rank in two)
+    weights = [key for key in one[apart] if not key.startswith("pool") and key != "losses"]
+    for key in weights:
+        torch.testing.assert_close(one[apart][key], one[actions][key], rtol=0, atol=0)  # a single process has no other
+        assert torch.equal(first[key], second[key])
+    assert any(not torch.equal(first[key], one[actions][key]) for key in weights)
+    assert distance({k: first[k] for k in weights}, one[actions]) < 0.3 * distance(
+        {k: one[actions][k] for k in weights}, {k: torch.zeros(()) for k in weights}
+    )
 
 
 def test_a_single_process_is_left_alone():

@@ -126,7 +126,9 @@ def test_a_robot_behind_an_old_filter_is_refused(verb, tmp_path):
 
 
 SINCE_0_3_OF_THE_LAW = [("law", name) for name in ("slack_ms", "unknown", "kappa", "replan_above", "engine")]
-SINCE_0_3_OF_TRAINING = [("margin", "noise"), ("margin", "gradient_penalty"), ("reachability", "hinge")]
+SINCE_0_3_OF_TRAINING = [
+    ("margin", "noise"), ("margin", "gradient_penalty"), ("reachability", "hinge"), ("reachability", "local_updates"),
+]  # fmt: skip
 
 
 def assert_same(first, second, n_steps=6):

@@ -181,6 +181,11 @@ def test_a_hinge_that_is_none_is_refused(hinge):
         ReachabilityConfig(hinge=hinge)
 
 
+def test_fewer_than_one_local_update_are_refused():
+    with pytest.raises(ValueError, match=r"--policy.reachability.local_updates is 0; expected at least 1"):
+        ReachabilityConfig(local_updates=0)
+
+
 def test_q_is_the_value_after_the_action():
     learner = small_learner(WindyChain(), torch.tensor([[-1.0], [1.0]]))
     pool = learner.pool

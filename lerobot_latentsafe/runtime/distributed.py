@@ -112,3 +112,11 @@ def sum_over_ranks(tensors: list[Tensor]) -> None:
     dist.all_reduce(flat)
     for tensor, total in zip(tensors, flat.split([t.numel() for t in tensors])):
         tensor.copy_(total.view_as(tensor))
+
+
+@torch.no_grad()
+def average_over_ranks(tensors: list[Tensor]) -> None:
+    """Replace tensors of one type by their means over ranks, in one message."""
+    sum_over_ranks(tensors)
+    for tensor in tensors:
+        tensor.div_(world_size())

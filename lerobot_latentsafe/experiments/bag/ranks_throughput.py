@@ -22,7 +22,9 @@ from lerobot_latentsafe.runtime.distributed import world_size
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
 from lerobot_latentsafe.training import encoded_starts, load_with_cache
 
-TASKS = ("world_model", "reachability", "reachability_2048")
+TASKS = ("world_model", "reachability", "reachability_2048", "reachability_apart")
+LOCAL_UPDATES = 8
+"""Of ranks that update apart."""
 TEAMS = {"one": 1, "two": 2, "two_alone": 2}
 """Team -> its processes."""
 
@@ -65,11 +67,12 @@ def training_steps(work: Work) -> Callable[[], int]:
     return train
 
 
-def reachability_steps(work: Work, batch_size: int | None = None) -> Callable[[], int]:
+def reachability_steps(work: Work, batch_size: int | None = None, local_updates: int = 1) -> Callable[[], int]:
     """Updates of the critic, imagining anew a part of its pool; returns the states that all ranks backed up.
 
     Args:
         batch_size: of a rank; None takes the configuration's.
+        local_updates: after which ranks average their weights; 1: they sum gradients at each.
     """
     policy, reader = load_with_cache(work.policy, metadata(work))
     model, own = policy.model, policy.config.reachability
@@ -77,6 +80,7 @@ def reachability_steps(work: Work, batch_size: int | None = None) -> Callable[[]
         own,
         batch_size=(batch_size or own.batch_size) * world_size(),
         pool=own.learned_steps * 1024 * world_size(),  # a chunk of 1024 starts a rank
+        local_updates=local_updates,
     )
     generator = torch.Generator().manual_seed(0)
     starts = encoded_starts(model, reader, generator, max_frames=5000)
@@ -102,7 +106,8 @@ def process(orders: Connection, work: Work, team: str, rank: int, port: int) -> 
     keep_freed_memory()
     if team == "two":
         dist.init_process_group("gloo", init_method=f"tcp://127.0.0.1:{port}", rank=rank, world_size=2)
-    tasks = dict(zip(TASKS, (training_steps(work), reachability_steps(work), reachability_steps(work, 2048))))
+    apart = reachability_steps(work, local_updates=LOCAL_UPDATES)
+    tasks = dict(zip(TASKS, (training_steps(work), reachability_steps(work), reachability_steps(work, 2048), apart)))
     orders.send(0)
     while (task := orders.recv()) is not None:
         orders.send(tasks[task]())
