@@ -26,11 +26,9 @@ def main() -> None:
     parser.add_argument("--seed", type=int)
     parser.add_argument("--half", action="store_true", help="store 16-bit weights")
     parser.add_argument("--device", default="cpu", help="to train on")
-    parser.add_argument("--ways", type=int, default=1, help="to grasp that the demonstrations show in one scene")
     given = parser.parse_args()
     repo_id = given.repo_id or f"latentsafe/{given.dataset.name}"
-    how = {name: getattr(given, name) for name in ("steps", "seed", "half", "device", "ways")}
-    train_seeing_policy(given.dataset, repo_id, given.output, **how)
+    train_seeing_policy(given.dataset, repo_id, given.output, given.steps, given.seed, given.half, given.device)
 
 
 if __name__ == "__main__":

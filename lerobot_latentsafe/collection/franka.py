@@ -113,10 +113,7 @@ SOURCES: dict[str, Source] = {
     "bag_middle": Source("bag", {"middle": 100}, astray=0.8),
     "bag_strong": Source("bag", {"middle": 240}, astray=0.8, pushed=0.1),
     "bag_weak": Source("bag", {"closed_end": 240}, variant="sealed", astray=0.8, pushed=0.1),
-    # Either grasp, and from a bad one to a good one: whom a filter stops must know what else to do.
-    "bag_mixed": Source(
-        "bag", {"closed_end": 100, "middle": 80, "regrasp": 60}, variant="sealed", astray=0.8, pushed=0.1, seconds=10.0
-    ),
+    "bag_mixed": Source("bag", {"closed_end": 120, "middle": 120}, variant="sealed", astray=0.8, pushed=0.1),
     "blocks_demos": Source("blocks", {"fetch": 200}),
     "blocks_random": Source("blocks", {"random": 200}),
 }

@@ -55,14 +55,8 @@ def _turn_to(scene: FrankaScene, yaw: float) -> float:
 
 # The bag
 
-GRASPED = {
-    "open_end": bag.MOUTH,
-    "middle": bag.MIDDLE,
-    "closed_end": bag.TAIL,
-    "regrasp": bag.TAIL,
-    "side_to_side": bag.TAIL,
-}
-"""Behaviour -> the segment that it grasps first."""
+GRASPED = {"open_end": bag.MOUTH, "middle": bag.MIDDLE, "closed_end": bag.TAIL, "side_to_side": bag.TAIL}
+"""Behaviour -> the segment that it lifts the bag by."""
 
 
 def grasp(
@@ -93,18 +87,6 @@ def lift(scene: bag.BagScene, segment: int, speed: float, rng: np.random.Generat
     yield from grasp(scene, segment, rng, 0.18)
     yield from reach(scene, scene.controller.position + up(rng.uniform(0.20, 0.26)), speed, CLOSED)
     yield from hold(CLOSED, 15)
-
-
-def regrasp(scene: bag.BagScene, speed: float, rng: np.random.Generator) -> Actions:
-    """Grasp the closed end and raise it a little, or not at all; put it down again, and lift the bag by its middle."""
-    yield from grasp(scene, bag.TAIL, rng, 0.18)
-    start = scene.controller.position
-    yield from reach(scene, start + up(rng.uniform(0, 0.08)), speed, CLOSED)
-    yield from hold(CLOSED, int(rng.integers(8)))
-    yield from reach(scene, start, 0.18, CLOSED)
-    yield from hold(OPEN, 6)
-    yield from reach(scene, scene.controller.position + up(0.04), 0.18, OPEN)
-    yield from lift(scene, bag.MIDDLE, speed, rng)
 
 
 def swing(scene: bag.BagScene, segment: int, speed: float, rng: np.random.Generator) -> Actions:
@@ -281,7 +263,6 @@ BAG: dict[str, tuple[Callable[..., Actions], tuple[float, float]]] = {
     "open_end": (lambda scene, speed, rng: lift(scene, bag.MOUTH, speed, rng), (0.10, MAX_SPEED)),
     "middle": (lambda scene, speed, rng: lift(scene, bag.MIDDLE, speed, rng), (0.10, 0.25)),
     "closed_end": (lambda scene, speed, rng: lift(scene, bag.TAIL, speed, rng), (0.15, MAX_SPEED)),
-    "regrasp": (regrasp, (0.10, 0.25)),
     "side_to_side": (lambda scene, speed, rng: swing(scene, bag.TAIL, speed, rng), (0.08, MAX_SPEED)),
     "branch": (branch, (0.05, MAX_SPEED)),
     "climb": (climb, (0.10, MAX_SPEED)),

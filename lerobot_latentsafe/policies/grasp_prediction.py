@@ -18,8 +18,6 @@ from lerobot_latentsafe.pictures import to_model_images
 
 KEYPOINTS, HIDDEN, DROPOUT = 16, 128, 0.1
 STEPS, LEARNING_RATE = 4000, 3e-3
-OTHERS = 0.05
-"""Share of the loss that is the error of all ways, not of the nearest alone: a way that is never near learns, too."""
 SMALL = 0.2
 """Motions below this share of their deviation are shown enlarged: a policy that goes down 20 mm beside is of no use."""
 MOSTLY, RARELY = 112, 16
@@ -29,9 +27,6 @@ MOSTLY, RARELY = 112, 16
 class GraspPredictor(nn.Module):
     """How the hand will move until the fingers next close, foreseen from a frame.
 
-    Where demonstrations of the same scene differ, their mean is what nobody did. So it can foresee several ways, of
-    which the nearest to what came learns (multiple choice learning, Guzman-Rivera et al. 2012).
-
     Each camera's patches vote for the places of a few learned keypoints (a spatial softmax): what is learned of an
     object in one place then holds in others, which components of whole pictures would have to be shown.
 
@@ -39,7 +34,6 @@ class GraspPredictor(nn.Module):
         n_cameras, n_patches, token_dim: of the tokens (N, n_patches, token_dim) of all cameras.
         state_dim: S, of proprioception.
         n_moves: M, numbers that tell a motion.
-        n_ways: W, motions that are foreseen.
     """
 
     token_mean: Tensor
@@ -49,7 +43,7 @@ class GraspPredictor(nn.Module):
     move_mean: Tensor
     move_std: Tensor
 
-    def __init__(self, n_cameras: int, n_patches: int, token_dim: int, state_dim: int, n_moves: int, n_ways: int = 1):
+    def __init__(self, n_cameras: int, n_patches: int, token_dim: int, state_dim: int, n_moves: int):
         super().__init__()
         side = round(n_patches**0.5)
         places = torch.linspace(-1, 1, side)
@@ -59,14 +53,14 @@ class GraspPredictor(nn.Module):
             nn.Linear(n_cameras * KEYPOINTS * 2 + state_dim, HIDDEN),
             nn.ReLU(),
             nn.Dropout(DROPOUT),
-            nn.Linear(HIDDEN, n_ways * n_moves),
+            nn.Linear(HIDDEN, n_moves),
         )
         for name, size in {"token": token_dim, "state": state_dim, "move": n_moves}.items():
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_std", torch.ones(size))
 
     def forward(self, tokens: Tensor, state: Tensor) -> Tensor:
-        """Tokens (N, P, C) and proprioception (N, S) -> the motions (N, W, M), in the units of proprioception."""
+        """Tokens (N, P, C) and proprioception (N, S) -> the motion (N, M), in the units of proprioception."""
         tokens = (tokens - self.token_mean) / self.token_std
         cameras = tokens.chunk(len(self.votes), -1)
         places = self.places.to(tokens)
@@ -75,11 +69,11 @@ class GraspPredictor(nn.Module):
             for vote, part in zip(self.votes, cameras)
         ]
         moves = self.head(torch.cat([*points, (state - self.state_mean) / self.state_std], -1))
-        return moves.unflatten(-1, (-1, len(self.move_mean))) * self.move_std + self.move_mean
+        return moves * self.move_std + self.move_mean
 
     def in_detail(self, moves: Tensor) -> Tensor:
-        """Motions (N, W, M) as policies read them (N, 2WM): as they are, and enlarged where they are small."""
-        return torch.cat([moves, (moves / (SMALL * self.move_std)).tanh()], -2).flatten(-2)
+        """Motions (N, M) as policies read them (N, 2M): as they are, and enlarged where they are small."""
+        return torch.cat([moves, (moves / (SMALL * self.move_std)).tanh()], -1)
 
     def fit(self, tokens: Tensor, state: Tensor, move: Tensor) -> None:
         """Learn from frames: tokens (N, P, C), proprioception (N, S), the motion that came (N, M)."""
@@ -96,8 +90,8 @@ class GraspPredictor(nn.Module):
         for _ in trange(STEPS, desc="aim", unit="step"):
             drawn, any_frames = torch.randint(len(before), (MOSTLY,)), torch.randint(len(state), (RARELY,))
             rows = torch.cat([before[drawn.to(before.device)], any_frames.to(before.device)])
-            error = ((self(tokens[rows], state[rows]) - move[rows, None]) / self.move_std).square().mean(-1)
-            loss = torch.lerp(error.amin(-1), error.mean(-1), OTHERS).mean()
+            error = (self(tokens[rows], state[rows]) - move[rows]) / self.move_std
+            loss = error.square().mean()
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
@@ -113,22 +107,21 @@ class GraspPredictionStep(ObservationProcessorStep):
         encoder, encoder_hash: see `PerceptionConfig`.
         image_size: side to which images (B, 3, H, W) in [0, 1] are area-averaged.
         cameras: their keys in the observation.
-        state_dim, n_moves, n_ways: see `GraspPredictor`.
+        state_dim, n_moves: see `GraspPredictor`.
     """
 
     def __init__(
-        self, encoder: str, encoder_hash: str, image_size: int, cameras: list[str], state_dim: int, n_moves: int,
-        n_ways: int = 1,
-    ):  # fmt: skip
+        self, encoder: str, encoder_hash: str, image_size: int, cameras: list[str], state_dim: int, n_moves: int
+    ):
         self.perception = Perception(PerceptionConfig(encoder, encoder_hash), cameras, image_size)
-        self.sizes = {"state_dim": state_dim, "n_moves": n_moves, "n_ways": n_ways}
+        self.sizes = {"state_dim": state_dim, "n_moves": n_moves}
         self.aim = GraspPredictor(
             len(cameras), self.perception.n_patches, self.perception.token_dim, **self.sizes
         ).eval()
 
     @torch.no_grad()
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
-        """An observation with the motions until the next grasp as `observation.environment_state` (B, 2WM)."""
+        """An observation with the motion until the next grasp as `observation.environment_state` (B, 2M)."""
         perception = self.perception
         missing = [key for key in (*perception.image_keys, OBS_STATE) if key not in observation]
         if missing:
@@ -162,7 +155,7 @@ class GraspPredictionStep(ObservationProcessorStep):
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
     ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
         """Features with what this step adds."""
-        seen = PolicyFeature(FeatureType.ENV, (2 * self.sizes["n_ways"] * self.sizes["n_moves"],))
+        seen = PolicyFeature(FeatureType.ENV, (2 * self.sizes["n_moves"],))
         observed = {**features.get(PipelineFeatureType.OBSERVATION, {}), OBS_ENV_STATE: seen}
         return {**features, PipelineFeatureType.OBSERVATION: observed}
 

@@ -7,7 +7,6 @@ next close, and adds that to a cached dataset; `let_see` makes the trained polic
 
 import shutil
 from collections.abc import Sequence
-from itertools import permutations
 from pathlib import Path
 
 import numpy as np
@@ -62,25 +61,13 @@ def until_switched(state: np.ndarray, command: np.ndarray, episode: np.ndarray) 
 
 @torch.no_grad()
 def foreseen(aim: GraspPredictor, tokens: Tensor, state: Tensor) -> Tensor:
-    """The motions (N, W, M) of many frames, in batches."""
+    """The motions (N, M) of many frames, in batches."""
     return torch.cat([aim(*rows) for rows in zip(tokens.split(512), state.split(512))])
-
-
-def in_the_order_of(expected: Tensor, moves: Tensor, scale: Tensor) -> Tensor:
-    """Motions (N, W, M) of one network with its ways in the order of another's: which comes first is chance.
-
-    Args:
-        scale: of each number of a motion (M,).
-    """
-    far = ((moves[:, :, None] - expected[:, None]) / scale).square().mean((0, -1))  # (W, W)
-    ways = range(moves.shape[1])
-    order = min(permutations(ways), key=lambda order: float(far[list(order), ways].sum()))
-    return moves[:, list(order)]
 
 
 def with_aim(
     cache_root: str | Path, repo_id: str, output_dir: str | Path, switch: str = SWITCH,
-    moved: Sequence[str] = ("ee_x.pos", "ee_y.pos", "ee_z.pos", "ee_rz.pos"), device: str = "cpu", n_ways: int = 1,
+    moved: Sequence[str] = ("ee_x.pos", "ee_y.pos", "ee_z.pos", "ee_rz.pos"), device: str = "cpu",
 ) -> LeRobotDataset:  # fmt: skip
     """Copy a token-cached dataset with the aim of each frame as a column that policies read, and the network beside it.
 
@@ -89,7 +76,6 @@ def with_aim(
     Args:
         switch: the command whose falling, such as the fingers' closing, is aimed at.
         moved: what of proprioception tells the motion until then.
-        n_ways: in which the same scene is acted in; several where demonstrations differ.
 
     Raises:
         EncoderMismatchError: the cache holds pictures, no tokens.
@@ -107,17 +93,16 @@ def with_aim(
 
     def learned_from(frames: Tensor) -> GraspPredictor:
         torch.manual_seed(0)
-        aim = GraspPredictor(n_cameras, n_patches, token_dim, state.shape[1], len(moved), n_ways).to(device)
+        aim = GraspPredictor(n_cameras, n_patches, token_dim, state.shape[1], len(moved)).to(device)
         aim.fit(tokens[frames], state[frames], move[frames])
         return aim
 
     # A policy is to learn from aims as wrong as it will live by: those of frames that the network did not learn from.
-    aim = learned_from(torch.ones_like(odd))
-    seen = torch.empty(len(move), n_ways, len(moved), device=device)
+    seen = torch.empty(len(move), len(moved))
     for half in (odd, ~odd):
-        moves = foreseen(learned_from(~half), tokens[half], state[half])
-        seen[half] = in_the_order_of(foreseen(aim, tokens[half], state[half]), moves, aim.move_std)
-    aim, seen = aim.cpu(), aim.in_detail(seen).cpu()
+        seen[half.cpu()] = foreseen(learned_from(~half), tokens[half], state[half]).cpu()
+    aim = learned_from(torch.ones_like(odd)).cpu()
+    seen = aim.in_detail(seen)
     feature = {"dtype": "float32", "shape": (seen.shape[1],), "names": None}
     with replacing_folder(output_dir) as folder:
         copy = add_features(
@@ -174,14 +159,11 @@ def let_see(checkpoint: str | Path, cache_root: str | Path, seen: str | Path, ou
     manifest = cache.manifest
     # On a CPU wherever it was trained; commands choose another by --policy.device.
     config, cameras = read_config(checkpoint, "cpu"), sorted(manifest["cameras"])
-    aim = load_file(Path(seen) / AIM)
-    n_moves = len(aim["move_mean"])
-    sizes = {"n_moves": n_moves, "n_ways": config.env_state_feature.shape[0] // (2 * n_moves)}
     step = GraspPredictionStep(
         manifest["encoder"], manifest["encoder_hash"], manifest["image_size"], cameras,
-        config.robot_state_feature.shape[0], **sizes,
+        config.robot_state_feature.shape[0], config.env_state_feature.shape[0] // 2,
     )  # fmt: skip
-    step.load_state_dict(aim)
+    step.load_state_dict(load_file(Path(seen) / AIM))
     pre, post = load_processors(config, checkpoint, "cpu")
     # After images are batched and on the device, before anything is normalised.
     at = next(i for i, s in enumerate(pre.steps) if isinstance(s, DeviceProcessorStep)) + 1

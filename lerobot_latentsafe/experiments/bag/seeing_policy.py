@@ -82,7 +82,7 @@ def encode(dataset: Path, repo_id: str) -> Path:
 
 def train_seeing_policy(
     dataset: Path, repo_id: str, output: Path, steps: int | None = None, seed: int | None = None, half: bool = False,
-    device: str = "cpu", ways: int = 1,
+    device: str = "cpu",
 ) -> None:  # fmt: skip
     """Encode demonstrations, learn to aim, train a policy on that, and write one that sees by itself.
 
@@ -92,11 +92,10 @@ def train_seeing_policy(
         steps, seed: of its training; by default those of the configuration.
         half: store 16-bit weights.
         device: to train on.
-        ways: to grasp that the demonstrations show in one scene.
     """
     tokens, seen = encode(dataset, repo_id), dataset.with_name(f"{dataset.name}_seen")
     if not (seen / AIM).exists():
-        with_aim(tokens, f"{repo_id}_cache", seen, device=device, n_ways=ways)
+        with_aim(tokens, f"{repo_id}_cache", seen, device=device)
     check_seen(seen, tokens)
     config = draccus.parse(TrainPipelineConfig, CONFIG, args=[])
     config.steps, config.seed = steps or config.steps, seed or config.seed
