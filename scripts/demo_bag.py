@@ -28,7 +28,12 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=sizes.steps, help="of the world model")
     parser.add_argument("--critic_steps", type=int, default=sizes.critic_steps)
     arguments = parser.parse_args()
-    sizes = FilterSizes(arguments.episodes, arguments.image_size, arguments.steps, arguments.critic_steps)
+    sizes = FilterSizes(
+        episodes=arguments.episodes,
+        image_size=arguments.image_size,
+        steps=arguments.steps,
+        critic_steps=arguments.critic_steps,
+    )
     run_demo(arguments.out, arguments.policy, arguments.base, arguments.n, arguments.encoder, sizes)
 
 

@@ -142,6 +142,9 @@ def test_the_demo_trains_a_filter_that_sees_by_an_encoder(script, base_path, enc
 
     def run(self, what, program, *options):
         ran.append(what.split(":")[0])
+        for option in options:
+            if option.startswith("--steps="):
+                stepped[ran[-1]] = option
         if program == "python":
             script(Path(options[0]).stem, *options[1:])
         elif program == "latentsafe":
@@ -152,14 +155,15 @@ def test_the_demo_trains_a_filter_that_sees_by_an_encoder(script, base_path, enc
             monkeypatch.setattr(sys, "argv", [program, *options])
             lerobot_edit_dataset.main()
 
-    ran = []
+    ran, stepped = [], {}
     monkeypatch.setattr(Demo, "run", run)
     monkeypatch.setitem(SCENES, "bag", replace(SCENES["bag"], episode_seconds=4.0, image_size=56))
     monkeypatch.setattr(demo_filter, "SOURCES", ("bag_mix", "bag_lifts"))
     monkeypatch.setattr(demo, "ThreadPoolExecutor", lambda n: ThreadPoolExecutor(1))
     size = 2 * load_encoder(encoder).patch
     options = [f"--out={tmp_path / 'demo'}", f"--encoder={encoder}", "--episodes=2", "--n=1", f"--base={base_path}"]
-    script("demo_bag", *options, f"--image_size={size}", "--steps=2", "--critic_steps=2")
+    script("demo_bag", *options, f"--image_size={size}", "--steps=2", "--critic_steps=3")
+    assert stepped == {"world model": "--steps=2", "reachability": "--steps=3"}
     assert ran == [
         "collect bag_mix", "collect bag_lifts", "merge", "cache", "world model", "margin", "reachability", "policies",
         "closed_end", "open_end",

@@ -13,7 +13,7 @@ FEW = ("--batch_size=32", "--policy.margin.clips=2000", "--policy.reachability.p
 """What of configs/bag_dino_wm.yaml takes long where a frame has many tokens."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class FilterSizes:
     """How much a filter costs, and how good it can be.
 
