@@ -14,7 +14,7 @@ from lerobot_latentsafe.experiments.dubins.demo import run_demo
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("outputs/demo"))
-    parser.add_argument("--epsilon", type=float, default=0.6, help="the filter acts where V <= epsilon")
+    parser.add_argument("--epsilon", type=float, default=0.7, help="the filter acts where V <= epsilon")
     parser.add_argument("--n_episodes", type=int, default=60)
     parser.add_argument("--seed", type=int, default=0, help="of what is recorded and trained")
     arguments = parser.parse_args()
