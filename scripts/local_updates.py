@@ -5,7 +5,8 @@ their gradients at each.
     scripts/local_updates.py --demos outputs/demo_0 outputs/demo_1 outputs/demo_2
 
 Trains critics of the car on the margins that `make demo` left, by one process, by two, and by two that update apart,
-and compares each with the exact safe set. Writes results/scale/local_updates.json: balanced accuracy of each variant.
+and compares the sign of each one's V with the exact safe set: of the critic alone, for a filter's look-ahead hides what
+a critic does not know. Writes results/scale/local_updates.json: balanced accuracy of each variant.
 """
 
 import argparse
@@ -17,7 +18,14 @@ from pathlib import Path
 from statistics import mean
 from tempfile import TemporaryDirectory
 
-from lerobot_latentsafe.evaluation.statistics import provenance, write_json
+import numpy as np
+import torch
+
+from lerobot_latentsafe.dubins.ground_truth import exact_value
+from lerobot_latentsafe.evaluation.statistics import confusion, provenance, write_json
+from lerobot_latentsafe.experiments.dubins.monitor import LatentMonitor
+from lerobot_latentsafe.modeling_latentsafe import load_filter
+from lerobot_latentsafe.safety_model import SafetyModel
 
 CLI = ("-m", "lerobot_latentsafe.cli")
 TWO = ("-m", "torch.distributed.run", "--standalone", "--local_addr=127.0.0.1", "--nproc_per_node=2", *CLI)
@@ -36,11 +44,15 @@ def balanced_accuracy(demo: Path, variant: str, seed: int, steps: int) -> float:
             "--dataset.repo_id=demo/random_cache", f"--dataset.root={demo / 'random_cache'}",
             f"--steps={steps}", f"--seeds=[{seed}]",
         )  # fmt: skip
-        run(
-            *CLI, "eval-monitor", f"--policy.path={critic}", "--env.type=latentsafe_dubins",
-            f"--states={demo / 'states.npy'}", f"--json={folder}/monitor.json",
-        )  # fmt: skip
-        return json.loads((Path(folder) / "monitor.json").read_text())["balanced_accuracy"]
+        return of_the_critic(load_filter(critic).model, np.load(demo / "states.npy"))
+
+
+@torch.no_grad()
+def of_the_critic(model: SafetyModel, states: np.ndarray) -> float:
+    """Balanced accuracy of the sign of V = min(l, max Q), without look-ahead, at states of the car (N, 3)."""
+    latents, imagination = LatentMonitor(model).latents(states), model.imagination
+    parts = [model.critic.value(imagination.features(z), imagination.margin(z)) for z in latents]
+    return confusion(torch.cat(parts).numpy() > 0, exact_value(states) > 0)["balanced_accuracy"]
 
 
 def copy_with(margin: Path, copy: Path, local_updates: int) -> None:
