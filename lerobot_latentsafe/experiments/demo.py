@@ -125,7 +125,8 @@ def _run(program: str, *options: str) -> None:
         runpy.run_path(options[0], run_name="__main__")
     elif program == "env":
         setting, *command = options
-        os.environ.update([setting.split("=", 1)])
+        name, _, value = setting.partition("=")
+        os.environ[name] = value
         _run(*command)
     else:
         sys.argv = [program, *options]
