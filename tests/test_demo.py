@@ -54,7 +54,7 @@ def test_the_bar_knows_all_steps(tmp_path, monkeypatch):
     assert {step for step in ran if step.split()[0] in ("collect", "train", "fit", "reachability")} == seeded
 
 
-def test_a_command_may_have_a_variable_of_its_environment_before_it(tmp_path, capfd):
+def test_a_command_may_have_a_variable_of_its_environment_before_it(tmp_path):
     script = tmp_path / "script.py"
     script.write_text("import os; print('precision is', os.environ['ACCELERATE_MIXED_PRECISION'])")
     shown = steps.Demo(tmp_path / "demo")

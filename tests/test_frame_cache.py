@@ -10,6 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 import tiny
 import torch
+import torch.nn.functional as F
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -112,6 +113,21 @@ def test_model_images_average_and_round_alike_for_bytes_and_floats():
     mean = images[0, 0, 0, :4, :4].float().mean()
     assert abs(small[0, 0, 0, 0, 0] * 255 - mean) <= 0.502
     torch.testing.assert_close(to_model_images(images, 64), images / 255.0)
+
+
+@pytest.mark.parametrize("shape", [(224, 224, 3), (480, 640, 3), (227, 227, 3), (2, 64, 48, 3), (2, 2, 40, 40, 1)])
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
+def test_pictures_are_averaged_alike_however_they_lie_in_memory(shape, dtype):
+    """Cameras and videos give the colours of a pixel side by side, LeRobot's processors one colour after the other."""
+    pixels = torch.randint(256, shape, dtype=torch.uint8)
+    images = (pixels if dtype == torch.uint8 else pixels / 255).movedim(-1, -3)
+    small = to_model_images(images, 96)
+    assert torch.equal(small, to_model_images(images.contiguous(), 96))
+    whole = images.float() / (255 if dtype == torch.uint8 else 1)
+    by_area = F.interpolate(whole.reshape(-1, *images.shape[-3:]), (96, 96), mode="area").view(
+        *images.shape[:-2], 96, 96
+    )
+    torch.testing.assert_close(small, by_area.expand_as(small), rtol=0, atol=0.51 / 255)
 
 
 @pytest.mark.parametrize("name", ["observation.image", "state", "action"])

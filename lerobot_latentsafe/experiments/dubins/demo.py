@@ -86,14 +86,8 @@ class DubinsDemo(Demo):
         folder = self.out / f"train_{source}"
         self.run(
             f"train {what}",
-            *(*before, "lerobot-train", f"--config_path=configs/{config}.yaml"),
-            *(
-                f"--dataset.repo_id=demo/{source}_cache",
-                f"--dataset.root={root}",
-                f"--output_dir={folder}",
-                f"--seed={self.seed}",
-                *options,
-            ),
+            *(*before, "lerobot-train", f"--config_path=configs/{config}.yaml", f"--seed={self.seed}"),
+            *(f"--dataset.repo_id=demo/{source}_cache", f"--dataset.root={root}", f"--output_dir={folder}", *options),
         )
         return str(folder / "checkpoints" / "last" / "pretrained_model")
 
