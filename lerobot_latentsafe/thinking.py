@@ -14,14 +14,12 @@ import torch
 from torch import Tensor
 
 from lerobot_latentsafe.latent import Latent, map_latent
-from lerobot_latentsafe.runtime.onnx_graph import Graph, GraphError
+from lerobot_latentsafe.runtime.onnx_graph import TOLERANCE, Graph, GraphError
 from lerobot_latentsafe.safety_model import SafetyModel
 from lerobot_latentsafe.tick import Frame, Thought, think, together
 
 logger = logging.getLogger(__name__)
 
-TOLERANCE = 1e-4
-"""What a graph says may differ from what torch says by so much, of large numbers by this share."""
 PROBES = 4
 """Frames about which both are asked before a graph is used."""
 Numbers = dict[str, Tensor]
@@ -150,7 +148,7 @@ class Thinking:
         probes = list(_probes(model, images))
         perception = model.world_model.frozen_perception()
         if perception is not None:
-            perception.compile(TOLERANCE)
+            perception.compile()
         graphs: dict[object, Graph] = {"think": _compared(model, _think, probes)}
         latent = {key: value[:1] for key, value in _under("latent", probes[-1]).items()}
         for hold in self.holds if law.name == "nearest" else []:

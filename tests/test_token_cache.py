@@ -11,12 +11,14 @@ import tiny
 import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from lerobot_latentsafe.cli.train import Cache
 from lerobot_latentsafe.datasets import cache_recipes
 from lerobot_latentsafe.datasets.build_cache import build_frame_cache
 from lerobot_latentsafe.datasets.frame_cache import FrameCache, FrameCacheError
 from lerobot_latentsafe.encoders.patch_encoders import EncoderError
 from lerobot_latentsafe.encoders.perception import EncoderMismatchError, PatchBasis, Perception
 from lerobot_latentsafe.pictures import to_model_images
+from lerobot_latentsafe.runtime.onnx_graph import Graph, GraphError
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +55,36 @@ def test_eight_bits_err_by_less_than_a_hundredth(dataset, token_root, tmp_path):
     )
     assert (small - large).norm() / large.norm() < 0.01
     assert FrameCache.open(tmp_path / "int8").percepts["tokens"].dtype == np.int8
+
+
+def test_onnx_runtime_encodes_as_torch_does(dataset, token_root, tmp_path, monkeypatch):
+    pytest.importorskip("onnxruntime")
+    by_graph, answer = [], Graph.__call__
+    monkeypatch.setattr(Graph, "__call__", lambda self, given: by_graph.append(given) or answer(self, given))
+    recipe = tiny.tokens(basis_from=token_root, engine="onnx")
+    build_frame_cache(dataset, tmp_path / "onnx", tiny.TOKEN_SIZE, recipe)
+    made, expected = (FrameCache.open(root) for root in (tmp_path / "onnx", token_root))
+    assert made.manifest["engine"] == "onnx" and "engine" not in expected.manifest
+    assert len(by_graph) > dataset.num_frames // cache_recipes.ENCODED_AT_ONCE // 2
+    for name, values in expected.percepts.items():
+        np.testing.assert_allclose(made.percepts[name], values, rtol=2e-3, atol=2e-3)  # both in 16 bits
+
+
+def test_without_onnx_runtime_no_cache_is_begun(dataset, tmp_path, monkeypatch):
+    monkeypatch.setattr(Perception, "_graphs", {})
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(GraphError, match="onnxruntime is missing: pip install"):
+        build_frame_cache(dataset, tmp_path / "onnx", tiny.TOKEN_SIZE, tiny.tokens(engine="onnx"))
+    assert not (tmp_path / "onnx" / "frame_cache").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [({"engine": "tensorrt"}, "expected torch or onnx"), ({"engine": "onnx", "encoder": None}, "give --encoder")],
+)
+def test_unknown_and_idle_engines_are_refused(options, said, tmp_path):
+    with pytest.raises(ValueError, match=said):
+        Cache(**{"output_dir": tmp_path / "cache", "encoder": "auto", **options})
 
 
 def test_killed_build_goes_on_and_equals_an_undisturbed_one(dataset, token_root, tmp_path, monkeypatch):

@@ -98,15 +98,21 @@ class Tokens:
         image_size: None: the encoder's default.
         dtype: of the tokens: float16, or int8 with a scale for each token.
         basis_from: a folder with a cache whose principal components to use, so that one world model reads both.
+        engine: what encodes: torch, or onnx, a graph of ONNX Runtime.
+
+    Raises:
+        GraphError: there is no such graph.
     """
 
     def __init__(
         self, cameras: list[str], image_size: int | None, config: PerceptionConfig, dtype: str = "float16",
-        basis_from: str | Path | None = None,
+        basis_from: str | Path | None = None, engine: str = "torch",
     ):  # fmt: skip
         if dtype not in TOKEN_TYPES:
             raise ValueError(f"--dtype is {dtype!r}; expected {' or '.join(TOKEN_TYPES)}")
         self.perception, self.dtype, self.basis_from = Perception(config, cameras, image_size), dtype, basis_from
+        if engine == "onnx":
+            self.perception.encode_by_graphs(ENCODED_AT_ONCE)
         self.arrays = {name: (size, "float16") for name, size in self.perception.sizes.items()}
         if dtype == "int8":
             n_patches, _ = shape = self.perception.sizes["tokens"]
@@ -118,6 +124,7 @@ class Tokens:
             "encoder_hash": self.perception.config.encoder_hash,
             "components": config.components,
             "token_components": config.token_components or 0,
+            **({} if engine == "torch" else {"engine": engine}),
         }
 
     def prepare(self, folder: Path, see: Sight, n_episodes: int) -> None:

@@ -11,7 +11,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from lerobot_latentsafe.encoders.patch_encoders import PatchEncoder, Seen, load_encoder
-from lerobot_latentsafe.runtime.onnx_graph import Graph, GraphError
+from lerobot_latentsafe.runtime.onnx_graph import TOLERANCE, Graph, GraphError
 
 logger = logging.getLogger(__name__)
 
@@ -235,6 +235,7 @@ class Perception(nn.Module):
         self.image_keys, self.image_size = sorted(image_keys), encoder.image_size if image_size is None else image_size
         self.config = replace(config, encoder=encoder.name, encoder_hash=encoder.weights_hash())
         self.encoder_hash = self.config.encoder_hash
+        self._compiled = False
         self._encoder = [encoder]  # in a list, so that its weights are not ours
         self.n_patches, n_cameras = encoder.n_patches(self.image_size, self.image_size), len(self.image_keys)
         self.basis = FrameBasis(self.n_patches * encoder.dim * n_cameras, config.components)
@@ -281,7 +282,8 @@ class Perception(nn.Module):
         return seen
 
     def _encoded(self, images: Tensor) -> Seen:
-        graph = self._graphs.get((self.encoder_hash, *images.shape)) if self._by_graphs else None
+        by_graphs = self._by_graphs or self._compiled
+        graph = self._graphs.get((self.encoder_hash, *images.shape)) if by_graphs else None
         if graph is None or images.device.type != "cpu":
             return self.encoder(images)
         try:
@@ -293,24 +295,30 @@ class Perception(nn.Module):
         return Seen(said["tokens"], said.get("class_token"))
 
     @torch.no_grad()
-    def compile(self, tolerance: float) -> None:
-        """Make a graph that encodes the pictures of one robot, for all that see with this encoder; see `use_graphs`.
-
-        Args:
-            tolerance: what it says may differ from what torch says by so much, of large numbers by this share.
+    def compile(self, n_frames: int = 1) -> None:
+        """Make a graph that encodes so many frames at once, for all that see with this encoder; see `use_graphs`.
 
         Raises:
-            GraphError: there is no such graph.
+            GraphError: there is no such graph, or it says something else than torch.
         """
-        shape = len(self.image_keys), 3, self.image_size, self.image_size
+        shape = n_frames * len(self.image_keys), 3, self.image_size, self.image_size
         if (self.encoder_hash, *shape) in self._graphs:
             return
         images = torch.rand(shape, generator=torch.Generator().manual_seed(0))
         graph = Graph(self.encoder, _say, {"images": images})
         expected, said = _say(self.encoder, images), graph({"images": images})
-        if not all(torch.allclose(said[key], expected[key], rtol=tolerance, atol=tolerance) for key in expected):
+        if not all(torch.allclose(said[key], expected[key], rtol=TOLERANCE, atol=TOLERANCE) for key in expected):
             raise GraphError(f"encoder {self.config.encoder} says something else as a graph than in torch")
         self._graphs[self.encoder_hash, *shape] = graph
+
+    def encode_by_graphs(self, n_frames: int) -> None:
+        """From now on encode so many frames at once by a graph, and others by torch.
+
+        Raises:
+            GraphError: there is no such graph, or it says something else than torch.
+        """
+        self.compile(n_frames)
+        self._compiled = True
 
     def _side_by_side(self, tokens: Tensor) -> Tensor:
         """Tokens (n_cameras x B, ..., dim), camera by camera, as (B, ..., n_cameras x dim)."""

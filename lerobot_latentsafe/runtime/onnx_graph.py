@@ -16,6 +16,8 @@ from torch import Tensor, nn
 from torch.onnx import register_custom_op_symbolic, symbolic_helper, unregister_custom_op_symbolic
 
 OPSET = 17
+TOLERANCE = 1e-4
+"""What a graph says may differ from what torch says by so much, of large numbers by this share."""
 
 
 class GraphError(RuntimeError):
