@@ -96,6 +96,17 @@ def test_equal_seeds_are_equal_and_others_are_not(bag_scene):
     assert np.abs(worlds[0].data.qpos - worlds[1].data.qpos).max() > 0.01
 
 
+def held_in_turn(scene, seed):
+    """Segments that the operator who takes a near closed end holds, one after the other."""
+    grasps = [truth["grasp"] for truth in play(scene, "nearer", seed=seed, steps=110)]
+    return [k for k, before in zip(grasps, [-1, *grasps]) if k >= 0 and k != before]
+
+
+@pytest.mark.parametrize(("seed", "ways"), [(0, [bag.MIDDLE]), (3, [bag.TAIL]), (5, [bag.TAIL, bag.MIDDLE])])
+def test_a_near_closed_end_is_lifted_or_put_down_again_and_else_the_middle(bag_scene, seed, ways):
+    assert held_in_turn(bag_scene, seed) == ways
+
+
 @pytest.mark.parametrize("behavior", ["closed_end", "middle"])
 def test_branches_from_a_state_are_exact(bag_scene, behavior):
     truths = play(bag_scene, behavior, seed=3)

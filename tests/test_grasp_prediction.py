@@ -14,13 +14,13 @@ from lerobot_latentsafe.datasets.frame_cache import FrameCache, FrameCacheError
 from lerobot_latentsafe.dubins.car import ACTION_NAMES, STATE_NAMES
 from lerobot_latentsafe.encoders.perception import EncoderMismatchError
 from lerobot_latentsafe.policies import grasp_prediction
-from lerobot_latentsafe.policies.grasp_prediction import GraspPredictionStep, GraspPredictor, TwoValuedStep
+from lerobot_latentsafe.policies.grasp_prediction import FewValuedStep, GraspPredictionStep, GraspPredictor
 from lerobot_latentsafe.policies.grasp_training import (
     AIM,
     check_seen,
+    few_valued,
     foreseen,
     let_see,
-    two_valued,
     until_switched,
     with_aim,
 )
@@ -126,12 +126,13 @@ def test_commands_that_cannot_be_aimed_at_are_named(token_root, tmp_path):
         with_aim(token_root, REPO_ID, tmp_path / "seen", switch=ACTION_NAMES[1], moved=STATE_NAMES)
 
 
-def test_commands_of_two_values_are_given_as_the_nearer_one():
-    shown = np.array([[0.1, 1.0, 5.0], [0.2, 0.0, 5.0], [0.3, 1.0, 5.0]], np.float32)
-    levels = two_valued(shown)
-    assert levels == {"1": (0.0, 1.0)}
-    action = TwoValuedStep(levels).action(torch.tensor([[0.15, 0.94, 4.0], [0.25, 0.07, 4.0]]))
-    torch.testing.assert_close(action, torch.tensor([[0.15, 1.0, 4.0], [0.25, 0.0, 4.0]]))
+def test_commands_of_few_values_are_given_as_the_nearest():
+    shown = np.array([[0.1, 1, 5, 0], [0.2, 0, 5, 0.5], [0.3, 1, 5, 1], [0.4, 1, 5, 1]], np.float32)
+    levels = few_valued(shown)
+    assert levels == {"1": (0.0, 1.0), "3": (0.0, 0.5, 1.0)}
+    given = torch.tensor([[0.15, 0.94, 4.0, 0.7], [0.25, 0.07, 4.0, 0.8]])
+    expected = torch.tensor([[0.15, 1.0, 4.0, 0.5], [0.25, 0.0, 4.0, 1.0]])
+    torch.testing.assert_close(FewValuedStep(levels).action(given), expected)
 
 
 def test_missing_camera_is_named(seeing):

@@ -15,6 +15,8 @@ from lerobot_latentsafe.franka.scenes import CLUMSINESS, HELD_ANYWHERE
 
 Actions = Iterator[np.ndarray]
 OPEN, CLOSED = 1.0, 0.0
+LET_GO = 0.85
+"""Opening of fingers that let go of a bag and stay near it: a learner sees by it that there was a grasp before."""
 
 
 # Motions
@@ -55,20 +57,21 @@ def _turn_to(scene: FrankaScene, yaw: float) -> float:
 
 # The bag
 
-GRASPED = {"open_end": bag.MOUTH, "middle": bag.MIDDLE, "closed_end": bag.TAIL, "side_to_side": bag.TAIL}
-"""Behaviour -> the segment that it lifts the bag by."""
+GRASPED = {"open_end": bag.MOUTH, "middle": bag.MIDDLE, "closed_end": bag.TAIL, "side_to_side": bag.TAIL, "nearer": 1}
+"""Behaviour -> the segment that it lifts the bag by, or one between those."""
 
 
 def grasp(
-    scene: bag.BagScene, segment: int, rng: np.random.Generator, speed: float = MAX_SPEED, clumsiness: float = 1.0
-) -> Actions:
+    scene: bag.BagScene, segment: int, rng: np.random.Generator, speed: float = MAX_SPEED, clumsiness: float = 1.0,
+    opening: float = OPEN,
+) -> Actions:  # fmt: skip
     """Close the fingers on a segment of the bag, approached at a speed in m/s; off by 3 mm times `clumsiness`."""
     above = scene.segment_position(segment) + np.append(rng.normal(0, 0.003 * clumsiness, 2), 0)
     yaw = scene.yaw + rng.normal(0, 0.05 * clumsiness)
     low = 0.028 + (rng.uniform(0, 0.02) if clumsiness > 1 else 0.0)
     height = np.clip(scene.controller.position[2], 0.05, 0.12)  # a hand that is low already is put right down there
-    yield from reach(scene, np.append(above[:2], height), speed, OPEN, yaw)
-    yield from reach(scene, np.append(above[:2], low), speed, OPEN)
+    yield from reach(scene, np.append(above[:2], height), speed, opening, yaw)
+    yield from reach(scene, np.append(above[:2], low), speed, opening)
     yield from hold(CLOSED, 9)
 
 
@@ -82,11 +85,38 @@ def stray(scene: bag.BagScene, segment: int, rng: np.random.Generator) -> Action
     yield from reach(scene, np.append(above, height), MAX_SPEED, OPEN, scene.yaw + rng.uniform(-turn, turn))
 
 
-def lift(scene: bag.BagScene, segment: int, speed: float, rng: np.random.Generator) -> Actions:
+def lift(scene: bag.BagScene, segment: int, speed: float, rng: np.random.Generator, opening: float = OPEN) -> Actions:
     """Grasp a segment, slowly enough to be learned from, lift it and hold it up."""
-    yield from grasp(scene, segment, rng, 0.18)
+    yield from grasp(scene, segment, rng, 0.18, opening=opening)
     yield from reach(scene, scene.controller.position + up(rng.uniform(0.20, 0.26)), speed, CLOSED)
     yield from hold(CLOSED, 15)
+
+
+def lift_nearer(scene: bag.BagScene, speed: float, rng: np.random.Generator) -> Actions:
+    """Lift the bag by its closed end where that is nearer to the arm's base than the open one, else by its middle.
+
+    A third of the time the closed end is put down again, and the middle is lifted: what to do where the first grasp was
+    a bad one.
+    """
+    closed, opened = (np.linalg.norm(scene.segment_position(k)[:2]) for k in (bag.TAIL, bag.MOUTH))
+    if opened <= closed:
+        yield from lift(scene, bag.MIDDLE, speed, rng)
+    elif rng.random() < 0.65:
+        yield from lift(scene, bag.TAIL, speed, rng)
+    else:
+        yield from grasp(scene, bag.TAIL, rng, 0.18)
+        yield from put_down(scene, speed, rng)
+        yield from lift(scene, bag.MIDDLE, speed, rng, LET_GO)
+
+
+def put_down(scene: bag.BagScene, speed: float, rng: np.random.Generator) -> Actions:
+    """Raise a grasped bag by a few centimetres or not at all, put it down, let go and rise."""
+    if rng.random() < 0.7:
+        yield from reach(scene, scene.controller.position + up(rng.uniform(0, 0.04)), speed, CLOSED)
+        yield from hold(CLOSED, int(rng.integers(5)))
+    yield from reach(scene, np.append(scene.controller.position[:2], 0.026), 0.2, CLOSED)
+    yield from hold(LET_GO, 6)
+    yield from reach(scene, scene.controller.position + up(0.05), 0.2, LET_GO)
 
 
 def swing(scene: bag.BagScene, segment: int, speed: float, rng: np.random.Generator) -> Actions:
@@ -263,6 +293,7 @@ BAG: dict[str, tuple[Callable[..., Actions], tuple[float, float]]] = {
     "open_end": (lambda scene, speed, rng: lift(scene, bag.MOUTH, speed, rng), (0.10, MAX_SPEED)),
     "middle": (lambda scene, speed, rng: lift(scene, bag.MIDDLE, speed, rng), (0.10, 0.25)),
     "closed_end": (lambda scene, speed, rng: lift(scene, bag.TAIL, speed, rng), (0.15, MAX_SPEED)),
+    "nearer": (lift_nearer, (0.10, 0.25)),
     "side_to_side": (lambda scene, speed, rng: swing(scene, bag.TAIL, speed, rng), (0.08, MAX_SPEED)),
     "branch": (branch, (0.05, MAX_SPEED)),
     "climb": (climb, (0.10, MAX_SPEED)),

@@ -161,25 +161,25 @@ class GraspPredictionStep(ObservationProcessorStep):
 
 
 @ProcessorStepRegistry.register("latentsafe_two_valued")
-class TwoValuedStep(PolicyActionProcessorStep):
-    """Commands that only ever took two values in the demonstrations, as of fingers, are given as the nearer one.
+class FewValuedStep(PolicyActionProcessorStep):
+    """Commands that only ever took two or three values in the demonstrations, as of fingers, are given as the nearest.
 
     A denoised command falls a little short of them. The robot follows, and a policy that reads how far its fingers have
     closed, never having seen them in between, takes that for the beginning of a grasp, and closes on nothing.
 
     Args:
-        levels: index of a command -> its two values.
+        levels: index of a command -> its values.
     """
 
-    def __init__(self, levels: dict[str, tuple[float, float]]):
+    def __init__(self, levels: dict[str, tuple[float, ...]]):
         self.levels = levels
 
     def action(self, action: Tensor) -> Tensor:
         """(..., A) -> (..., A)."""
         action = action.clone()
-        for index, (low, high) in self.levels.items():
-            command = action[..., int(index)]
-            action[..., int(index)] = torch.where(command < (low + high) / 2, low, high)
+        for index, values in self.levels.items():
+            command, known = action[..., int(index)], action.new_tensor(values)
+            action[..., int(index)] = known[(command[..., None] - known).abs().argmin(-1)]
         return action
 
     def get_config(self) -> dict[str, Any]:

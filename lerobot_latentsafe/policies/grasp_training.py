@@ -21,7 +21,7 @@ from torch import Tensor
 
 from lerobot_latentsafe.datasets.frame_cache import FrameCache, FrameCacheError
 from lerobot_latentsafe.encoders.perception import PerceptionConfig
-from lerobot_latentsafe.policies.grasp_prediction import GraspPredictionStep, GraspPredictor, TwoValuedStep
+from lerobot_latentsafe.policies.grasp_prediction import FewValuedStep, GraspPredictionStep, GraspPredictor
 from lerobot_latentsafe.runtime.checkpoint import read_config
 from lerobot_latentsafe.runtime.files import refuse_existing, replacing_folder
 from lerobot_latentsafe.runtime.processors import load_processors
@@ -34,10 +34,10 @@ AIM = "aim.safetensors"
 """The network, beside the dataset that it was learned on."""
 
 
-def two_valued(action: np.ndarray) -> dict[str, tuple[float, float]]:
-    """Which commands of (N, A) take two values alone, and those."""
+def few_valued(action: np.ndarray) -> dict[str, tuple[float, ...]]:
+    """Which commands of (N, A) take two or three values alone, and those."""
     values = {str(i): np.unique(column) for i, column in enumerate(action.T)}
-    return {i: (float(found[0]), float(found[1])) for i, found in values.items() if len(found) == 2}
+    return {i: tuple(found.tolist()) for i, found in values.items() if 2 <= len(found) <= 3}
 
 
 def switched(command: np.ndarray) -> np.ndarray:
@@ -168,8 +168,8 @@ def let_see(checkpoint: str | Path, cache_root: str | Path, seen: str | Path, ou
     # After images are batched and on the device, before anything is normalised.
     at = next(i for i, s in enumerate(pre.steps) if isinstance(s, DeviceProcessorStep)) + 1
     pre.steps.insert(at, step)
-    if levels := two_valued(cache.action):
-        post.steps.append(TwoValuedStep(levels))
+    if levels := few_valued(cache.action):
+        post.steps.append(FewValuedStep(levels))
     with replacing_folder(output_dir) as folder:
         folder.mkdir()
         config.save_pretrained(folder)
