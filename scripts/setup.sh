@@ -29,7 +29,8 @@ if ! "$uv" venv --quiet --clear --python 3.12 .venv; then
   echo "       then run make setup again." >&2
   exit 1
 fi
-if ! "$uv" pip install --quiet --python .venv/bin/python -r requirements.lock; then
+# Bytecode now, as pip makes it: else the first command of each kind takes tens of seconds, and seems to hang.
+if ! "$uv" pip install --quiet --compile-bytecode --python .venv/bin/python -r requirements.lock; then
   echo "setup: cannot install what requirements.lock pins. Its packages exist for Linux (x86-64 and aarch64), macOS" >&2
   echo "       (Apple silicon) and Windows (x86-64). If this is one of them, the reason is above; run make setup again." >&2
   exit 1
