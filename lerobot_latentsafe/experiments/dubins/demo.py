@@ -136,7 +136,7 @@ class DubinsDemo(Demo):
     def reckless(self) -> str:
         """Collect reckless demonstrations and train a diffusion policy on them; returns its folder."""
         root = self.data("reckless", N_RECKLESS)
-        # LeRobot's reading of a frame costs more than learning from it, and actions are learned sooner than their noise.
+        # LeRobot takes longer to read a frame than to learn from it, and actions are learned sooner than noise.
         how = "--steps=250", "--batch_size=16", "--policy.prediction_type=sample"
         return self.train("reckless diffusion policy", "dubins_diffusion", "reckless", root, *how)
 
