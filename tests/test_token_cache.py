@@ -15,6 +15,7 @@ from lerobot_latentsafe.cli.train import Cache
 from lerobot_latentsafe.datasets import cache_recipes
 from lerobot_latentsafe.datasets.build_cache import build_frame_cache
 from lerobot_latentsafe.datasets.frame_cache import FrameCache, FrameCacheError
+from lerobot_latentsafe.datasets.join_caches import join_caches
 from lerobot_latentsafe.encoders.patch_encoders import EncoderError
 from lerobot_latentsafe.encoders.perception import EncoderMismatchError, PatchBasis, Perception
 from lerobot_latentsafe.pictures import to_model_images
@@ -64,10 +65,11 @@ def test_onnx_runtime_encodes_as_torch_does(dataset, token_root, tmp_path, monke
     recipe = tiny.tokens(basis_from=token_root, engine="onnx")
     build_frame_cache(dataset, tmp_path / "onnx", tiny.TOKEN_SIZE, recipe)
     made, expected = (FrameCache.open(root) for root in (tmp_path / "onnx", token_root))
-    assert made.manifest["engine"] == "onnx" and "engine" not in expected.manifest
     assert len(by_graph) > dataset.num_frames // cache_recipes.ENCODED_AT_ONCE // 2
     for name, values in expected.percepts.items():
         np.testing.assert_allclose(made.percepts[name], values, rtol=2e-3, atol=2e-3)  # both in 16 bits
+    joined = join_caches([token_root, tmp_path / "onnx"], "me/both", tmp_path / "both")
+    assert joined.manifest["n_frames"] == 2 * expected.manifest["n_frames"]
 
 
 def test_without_onnx_runtime_no_cache_is_begun(dataset, tmp_path, monkeypatch):

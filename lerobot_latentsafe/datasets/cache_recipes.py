@@ -124,7 +124,6 @@ class Tokens:
             "encoder_hash": self.perception.config.encoder_hash,
             "components": config.components,
             "token_components": config.token_components or 0,
-            **({} if engine == "torch" else {"engine": engine}),
         }
 
     def prepare(self, folder: Path, see: Sight, n_episodes: int) -> None:
