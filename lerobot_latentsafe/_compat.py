@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 from lerobot.utils.constants import ACTION
 from lerobot.utils.import_utils import require_package
 from torch import Tensor
+from torch.nn.parallel import DistributedDataParallel
 
 if TYPE_CHECKING:
     from lerobot.configs.policies import PreTrainedConfig
@@ -41,6 +42,15 @@ ADAPTER = "adapter_config.json"
 
 NOT_AVERAGED = "_ddp_params_and_buffers_to_ignore"
 """The attribute in which torch's DistributedDataParallel, which LeRobot wraps policies in, looks for names."""
+
+
+def send_no_gradients() -> None:
+    """Keep gradients on this rank where DistributedDataParallel is in its forward pass, as in its `no_sync`.
+
+    LeRobot's training enters no `no_sync` and gives the wrapper to nobody.
+    """
+    if (wrapper := DistributedDataParallel._active_ddp_module) is not None:
+        wrapper.require_backward_grad_sync = False
 
 
 def quiet_decoder() -> None:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import NormalizationMode
@@ -19,6 +19,9 @@ from lerobot_latentsafe.decision import LawConfig
 from lerobot_latentsafe.margin import MarginConfig
 from lerobot_latentsafe.units import TrainedOn
 from lerobot_latentsafe.world_models import RSSMConfig, WorldModelConfig
+
+if TYPE_CHECKING:
+    from lerobot.configs.train import TrainPipelineConfig
 
 SEALED = ("world_model", "fallback", "trained_on")
 """Groups that belong to the weights; the others are the user's."""
@@ -69,6 +72,9 @@ class LatentSafeConfig(PreTrainedConfig):
         calibration: the evidence epsilon was chosen on, see `Calibration`; written by `latentsafe calibrate`.
         evaluation: what was measured -> the rate in words; written by `latentsafe push --results=...` for the card.
         optimizer_lr, grad_clip_norm, scheduler_steps: of the training of world model and margin by lerobot-train.
+        local_updates: steps of that training that each of several processes takes by itself before their weights are
+            averaged, which saves most of the waiting. 1: gradients are averaged at each, and together the processes
+            learn what one would.
         drop_n_last_frames: frames at the end of each episode at which no training window starts.
         normalization_mapping: identity: state and actions are scaled by the model with the numbers that it stores.
     """
@@ -91,6 +97,7 @@ class LatentSafeConfig(PreTrainedConfig):
     optimizer_lr: float = 1e-3
     grad_clip_norm: float = 100.0
     scheduler_steps: int = 3000
+    local_updates: int = 1
     drop_n_last_frames: int = 1
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: dict.fromkeys(("VISUAL", "STATE", "ACTION", "ENV"), NormalizationMode.IDENTITY)
@@ -100,6 +107,8 @@ class LatentSafeConfig(PreTrainedConfig):
         super().__post_init__()
         if self.base_ahead < 0:
             raise ValueError(f"--policy.base_ahead is {self.base_ahead}; expected 0 (on the control thread) or more")
+        if self.local_updates < 1:
+            raise ValueError(f"--policy.local_updates is {self.local_updates}; expected at least 1")
         self.require_critic_of_law()
         self.require_known_commands()
         self.likeness.require_known(self.constraints, self.trained_on.stage == "critic")
@@ -172,12 +181,24 @@ class LatentSafeConfig(PreTrainedConfig):
 
         Raises:
             DatasetContractError: it would end in an error of its own there.
+            ValueError: it would save weights that its processes have not averaged.
         """
         run = training_run()
+        if run is not None:
+            self._require_averaged_checkpoints(run)
         folder = None if run is None else run.dataset.root or HF_LEROBOT_HOME / str(run.dataset.repo_id)
         if folder is not None and (run.dataset.root or Path(folder).exists()):
             check_for_lerobot(Path(folder), run.dataset.use_imagenet_stats)
         return FusedAdamConfig(lr=self.optimizer_lr, weight_decay=0.0, grad_clip_norm=self.grad_clip_norm)
+
+    def _require_averaged_checkpoints(self, run: "TrainPipelineConfig") -> None:
+        for name in ("steps", "save_freq"):
+            steps, apart = getattr(run, name), self.local_updates
+            if steps % apart:
+                raise ValueError(
+                    f"--{name} is {steps}, and with --policy.local_updates={apart} weights are averaged after each "
+                    f"{apart} steps; give --{name}={apart * max(1, round(steps / apart))}, or another multiple"
+                )
 
     def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
         """Cosine decay to a twentieth after 100 steps of warm-up."""

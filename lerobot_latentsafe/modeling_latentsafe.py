@@ -5,6 +5,7 @@ them. `select_action` is the fallback policy; given a base policy, it is the bas
 """
 
 import logging
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -42,6 +43,7 @@ from lerobot_latentsafe.runtime.checkpoint import (
     weights_digest,
     writing_checkpoint,
 )
+from lerobot_latentsafe.runtime.distributed import agree, on_its_own
 from lerobot_latentsafe.runtime.locations import CheckpointError, resolve_checkpoint
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
 from lerobot_latentsafe.runtime.processors import check_own_processors
@@ -87,6 +89,7 @@ class LatentSafePolicy(PreTrainedPolicy):
         if data is not None and data.cache is not None:
             self.model.world_model.load_basis(Path(data.frame_cache))
         setattr(self, NOT_AVERAGED, self._never_averaged())
+        self._steps = 0
         self._told_untrained = self._told_outdated = False
         self._base: list[BasePolicy] = []  # in a list, so that its weights are not ours
         self._base_lost = False
@@ -118,9 +121,18 @@ class LatentSafePolicy(PreTrainedPolicy):
             )
         if self.model.device.type == "cpu":
             keep_freed_memory()
-        loss, _, metrics = self.model.clip_loss(self.reader.read(batch, self.model))
+        clip = self.reader.read(batch, self.model)
+        with on_its_own() if self.config.local_updates > 1 else nullcontext():
+            loss, _, metrics = self.model.clip_loss(clip)
         told = torch.stack([torch.as_tensor(value, device=loss.device).float() for value in metrics.values()])
         return loss, dict(zip(metrics, told.tolist()))  # a GPU is waited for once
+
+    def update(self) -> None:
+        """Average weights over ranks after every `local_updates` steps; LeRobot calls this after each."""
+        self._steps += 1
+        if self.config.local_updates > 1 and self._steps % self.config.local_updates == 0:
+            agree(self.model.world_model)
+            agree(self.model.margin)
 
     # -- deployment ---
 

@@ -1,7 +1,8 @@
 #!/usr/bin/env python
 """Throughput of two ranks against one, each on a single thread and with a batch of the same size a rank.
 
-    world_model     gradient steps on clips from a token cache, with DistributedDataParallel as LeRobot sets it up
+    world_model     gradient steps on clips from a token cache, with DistributedDataParallel as LeRobot sets it up;
+                    and with weights that are averaged after every 8 steps
     reachability    `refresh` updates of the critic and the imagination of a part of its pool, as in
                     `latentsafe train-reachability`; two ranks have a batch and a pool of twice the size. With the
                     batch of the configuration, with one of 2048 states a rank, and with weights that are averaged
@@ -28,7 +29,7 @@ def main() -> None:
     parser.add_argument("--policy", type=Path, required=True, help="a filter with a trained gru world model")
     parser.add_argument("--cache", type=Path, required=True, help="a token cache that fits it")
     parser.add_argument("--rounds", type=int, default=6)
-    parser.add_argument("--steps", type=int, default=20, help="gradient steps of the world model a round")
+    parser.add_argument("--steps", type=int, default=24, help="steps of the world model a round, a multiple of 8")
     parser.add_argument("--batch", type=int, default=96, help="clips a rank and step")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()

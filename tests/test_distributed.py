@@ -22,11 +22,11 @@ WORLD_MODELS = {"rssm": tiny.rssm_config, "gru": tiny.gru_config, "dino_wm": tin
 ACTIONS = {"discrete": tiny.CANDIDATES, "continuous": None}
 
 
-def train_world_model(root, name):
-    """Losses and weights of three steps on windows of which the last half, the second rank's, run past their ends."""
+def train_world_model(root, name, local_updates=1):
+    """Losses and weights of four steps on windows of which the last half, the second rank's, run past their ends."""
     torch.manual_seed(distributed.rank())  # weights that differ, until the first rank's are taken over
     meta = tiny.metadata(root)
-    policy = tiny.new_policy(meta, world_model=WORLD_MODELS[name]()).train()
+    policy = tiny.new_policy(meta, world_model=WORLD_MODELS[name](), local_updates=local_updates).train()
     model = policy
     if distributed.world_size() > 1:  # as accelerate does for lerobot-train
         model = DistributedDataParallel(policy, find_unused_parameters=True)
@@ -35,12 +35,13 @@ def train_world_model(root, name):
     whole = torch.arange(0, 24, 3)
     ends = torch.as_tensor(meta.episodes["dataset_to_index"])[:8] - 3
     losses = []
-    for step in range(3):
+    for step in range(4):
         loss, metrics = model({"index": distributed.share(torch.cat([whole + step, ends + step]))})
         optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(policy.get_optim_params(), 1.0)
         optimizer.step()
+        policy.update()
         losses.append(distributed.mean_over_ranks(torch.tensor([loss.item(), metrics["loss_margin"]])))
     assert policy.config.trained_on.stage == "world_model"
     weights = {name: w for name, w in policy.state_dict().items() if not name.startswith("model.critic")}
@@ -66,6 +67,8 @@ def learn_reachability(root, actions, **changes):
 def everything(car_cache, car_tokens):
     roots = {"rssm": car_cache, "gru": car_tokens, "dino_wm": car_tokens}
     found = {name: train_world_model(roots[name], name) for name in WORLD_MODELS}
+    for name in WORLD_MODELS:
+        found[f"{name}, apart"] = train_world_model(roots[name], name, local_updates=2)
     for actions in ACTIONS:
         found[actions] = learn_reachability(car_cache, actions)
         found[f"{actions}, apart"] = learn_reachability(car_cache, actions, local_updates=4)
@@ -99,16 +102,16 @@ def test_two_ranks_train_what_one_does(one, two, name):
             torch.testing.assert_close(rank[name][key], value, rtol=1e-3, atol=2e-5, msg=lambda m, k=key: f"{k}: {m}")
 
 
-@pytest.mark.parametrize("actions", ACTIONS)
-def test_two_ranks_that_update_apart_agree_in_the_end_on_about_what_one_learns(one, two, actions):
-    apart, (first, second) = f"{actions}, apart", (rank[f"{actions}, apart"] for rank in two)
+@pytest.mark.parametrize("name", [*WORLD_MODELS, *ACTIONS])
+def test_two_ranks_that_update_apart_agree_in_the_end_on_about_what_one_learns(one, two, name):
+    apart, (first, second) = f"{name}, apart", (rank[f"{name}, apart"] for rank in two)
     weights = [key for key in one[apart] if not key.startswith("pool") and key != "losses"]
     for key in weights:
-        torch.testing.assert_close(one[apart][key], one[actions][key], rtol=0, atol=0)  # a single process has no other
+        torch.testing.assert_close(one[apart][key], one[name][key], rtol=0, atol=0)  # a single process has no other
         assert torch.equal(first[key], second[key])
-    assert any(not torch.equal(first[key], one[actions][key]) for key in weights)
-    assert distance({k: first[k] for k in weights}, one[actions]) < 0.3 * distance(
-        {k: one[actions][k] for k in weights}, {k: torch.zeros(()) for k in weights}
+    assert any(not torch.equal(first[key], one[name][key]) for key in weights)
+    assert distance({k: first[k] for k in weights}, one[name]) < 0.3 * distance(
+        {k: one[name][k] for k in weights}, {k: torch.zeros(()) for k in weights}
     )
 
 

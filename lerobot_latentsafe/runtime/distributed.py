@@ -13,7 +13,12 @@ from contextlib import contextmanager
 
 import torch
 import torch.distributed as dist
-from torch import Tensor
+from torch import Tensor, nn
+
+from lerobot_latentsafe._compat import send_no_gradients
+
+_alone = False
+"""Within `on_its_own`."""
 
 
 @contextmanager
@@ -45,8 +50,8 @@ def rank() -> int:
 
 
 def mean_over_ranks(x: Tensor) -> Tensor:
-    """Average over ranks of a tensor of any shape, without gradient."""
-    if world_size() == 1:
+    """Average over ranks of a tensor of any shape, without gradient; a rank's own value within `on_its_own`."""
+    if _alone or world_size() == 1:
         return x
     mean = x.detach().to(torch.float32, copy=True) / world_size()
     dist.all_reduce(mean)
@@ -55,7 +60,7 @@ def mean_over_ranks(x: Tensor) -> Tensor:
 
 def from_first_rank(x: Tensor) -> Tensor:
     """What the first rank has: a draw that must be the same for the whole batch. Changes x in place."""
-    if world_size() > 1:
+    if world_size() > 1 and not _alone:
         dist.broadcast(x, 0)
     return x
 
@@ -74,6 +79,33 @@ def _share_of_all(draw: Callable[..., Tensor], x: Tensor) -> Tensor:
     n = len(x)
     noise = draw(world_size() * n, *x.shape[1:], dtype=x.dtype, device=x.device)
     return noise[rank() * n : (rank() + 1) * n]
+
+
+# -- of ranks that take some steps by themselves ---
+
+
+@contextmanager
+def on_its_own() -> Iterator[None]:
+    """A forward pass of which other ranks hear nothing: means are of this rank's batch, and gradients stay here."""
+    global _alone
+    send_no_gradients()
+    _alone = True
+    try:
+        yield
+    finally:
+        _alone = False
+
+
+@torch.no_grad()
+def agree(module: nn.Module) -> None:
+    """Average the numbers of a module over ranks; of flags and counts the largest is taken."""
+    if world_size() == 1:
+        return
+    tensors = [*module.parameters(), *module.buffers()]
+    average_over_ranks([t for t in tensors if t.is_floating_point()])
+    for tensor in tensors:
+        if not tensor.is_floating_point():
+            dist.all_reduce(tensor, dist.ReduceOp.MAX)
 
 
 # -- of one batch that is split: every rank makes the same draws and takes its share ---

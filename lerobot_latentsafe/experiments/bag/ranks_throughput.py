@@ -22,9 +22,9 @@ from lerobot_latentsafe.runtime.distributed import world_size
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
 from lerobot_latentsafe.training import encoded_starts, load_with_cache
 
-TASKS = ("world_model", "reachability", "reachability_2048", "reachability_apart")
+TASKS = ("world_model", "world_model_apart", "reachability", "reachability_2048", "reachability_apart")
 LOCAL_UPDATES = 8
-"""Of ranks that update apart."""
+"""Of ranks that learn apart."""
 TEAMS = {"one": 1, "two": 2, "two_alone": 2}
 """Team -> its processes."""
 
@@ -35,7 +35,7 @@ class Work:
 
     Attributes:
         policy, cache: folders of a filter with a trained world model, and of a token cache that fits it.
-        steps: gradient steps of the world model.
+        steps: gradient steps of the world model; a multiple of LOCAL_UPDATES.
         batch: clips of a rank and step.
     """
 
@@ -45,9 +45,14 @@ class Work:
     batch: int
 
 
-def training_steps(work: Work) -> Callable[[], int]:
-    """Some gradient steps of the world model; returns the clips that all ranks learned from."""
+def training_steps(work: Work, local_updates: int = 1) -> Callable[[], int]:
+    """Some gradient steps of the world model; returns the clips that all ranks learned from.
+
+    Args:
+        local_updates: after which ranks average their weights; 1: they average gradients at each.
+    """
     policy, reader = load_with_cache(work.policy, metadata(work))
+    policy.config.change(local_updates=local_updates)
     policy.reader = reader
     policy.train()
     several = world_size() > 1
@@ -62,6 +67,7 @@ def training_steps(work: Work) -> Callable[[], int]:
             loss.backward()
             torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
             optimizer.step()
+            policy.update()  # as lerobot-train does
         return work.steps * work.batch * world_size()
 
     return train
@@ -106,8 +112,13 @@ def process(orders: Connection, work: Work, team: str, rank: int, port: int) -> 
     keep_freed_memory()
     if team == "two":
         dist.init_process_group("gloo", init_method=f"tcp://127.0.0.1:{port}", rank=rank, world_size=2)
-    apart = reachability_steps(work, local_updates=LOCAL_UPDATES)
-    tasks = dict(zip(TASKS, (training_steps(work), reachability_steps(work), reachability_steps(work, 2048), apart)))
+    tasks = {
+        "world_model": training_steps(work),
+        "world_model_apart": training_steps(work, LOCAL_UPDATES),
+        "reachability": reachability_steps(work),
+        "reachability_2048": reachability_steps(work, 2048),
+        "reachability_apart": reachability_steps(work, local_updates=LOCAL_UPDATES),
+    }
     orders.send(0)
     while (task := orders.recv()) is not None:
         orders.send(tasks[task]())
