@@ -7,6 +7,7 @@ import tiny
 import torch
 from safetensors.torch import load_file
 
+from lerobot_latentsafe.configuration_latentsafe import LatentSafeConfig
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy
 
 STEPS = 4
@@ -70,3 +71,30 @@ def test_resumed_run_ends_with_the_weights_of_an_uninterrupted_one(trained):
     for name, value in resumed.items():
         torch.testing.assert_close(value, uninterrupted[name], atol=1e-6, rtol=1e-5, msg=lambda m, n=name: f"{n}: {m}")
     LatentSafePolicy.from_pretrained(final)  # sealed again
+
+
+def of_two_processes(root, output_dir, **options):
+    return (
+        "--policy.type=latentsafe", "--policy.device=cpu", "--policy.push_to_hub=false",
+        "--policy.world_model.type=rssm", f"--dataset.repo_id={tiny.REPO_ID}", f"--dataset.root={root}",
+        f"--output_dir={output_dir}", *(f"--{name}={value}" for name, value in options.items()),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("steps", "save_freq", "apart", "says"),
+    [
+        (10, 8, 4, "--steps is 10, and with --policy.local_updates=4 .* give --steps=8"),
+        (8, 3, 4, "--save_freq is 3, and with --policy.local_updates=4 .* give --save_freq=4"),
+    ],
+)
+def test_no_checkpoint_is_saved_between_two_averages(cache_root, tmp_path, steps, save_freq, apart, says):
+    options = {"steps": steps, "save_freq": save_freq, "policy.local_updates": apart}
+    with pytest.raises(ValueError, match=says):
+        lerobot_train(*of_two_processes(cache_root, tmp_path / "out", **options))
+    assert not (tmp_path / "out" / "checkpoints").exists()
+
+
+def test_local_updates_below_one_are_refused():
+    with pytest.raises(ValueError, match="local_updates is 0; expected at least 1"):
+        LatentSafeConfig(local_updates=0)
