@@ -160,6 +160,20 @@ class LatentSafeConfig(PreTrainedConfig):
         for name, value in groups.items():
             setattr(self, name, value)
 
+    def require_averaged_checkpoints(self, run: "TrainPipelineConfig") -> None:
+        """Refuse a training that would save weights which its processes have not averaged.
+
+        Raises:
+            ValueError: naming the option and what it may be.
+        """
+        apart = self.local_updates
+        for name in ("steps", "save_freq"):
+            if (steps := getattr(run, name)) % apart:
+                raise ValueError(
+                    f"--{name} is {steps}, and with --policy.local_updates={apart} weights are averaged after each "
+                    f"{apart} steps; give --{name}={apart * max(1, round(steps / apart))}, or another multiple"
+                )
+
     @property
     def observation_delta_indices(self) -> list[int] | None:
         """The frames of a clip; with a frame cache the policy cuts them itself, from `index`."""
@@ -181,24 +195,12 @@ class LatentSafeConfig(PreTrainedConfig):
 
         Raises:
             DatasetContractError: it would end in an error of its own there.
-            ValueError: it would save weights that its processes have not averaged.
         """
         run = training_run()
-        if run is not None:
-            self._require_averaged_checkpoints(run)
         folder = None if run is None else run.dataset.root or HF_LEROBOT_HOME / str(run.dataset.repo_id)
         if folder is not None and (run.dataset.root or Path(folder).exists()):
             check_for_lerobot(Path(folder), run.dataset.use_imagenet_stats)
         return FusedAdamConfig(lr=self.optimizer_lr, weight_decay=0.0, grad_clip_norm=self.grad_clip_norm)
-
-    def _require_averaged_checkpoints(self, run: "TrainPipelineConfig") -> None:
-        for name in ("steps", "save_freq"):
-            steps, apart = getattr(run, name), self.local_updates
-            if steps % apart:
-                raise ValueError(
-                    f"--{name} is {steps}, and with --policy.local_updates={apart} weights are averaged after each "
-                    f"{apart} steps; give --{name}={apart * max(1, round(steps / apart))}, or another multiple"
-                )
 
     def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
         """Cosine decay to a twentieth after 100 steps of warm-up."""

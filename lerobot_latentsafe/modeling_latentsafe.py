@@ -82,6 +82,8 @@ class LatentSafePolicy(PreTrainedPolicy):
         super().__init__(config)
         data = None
         if dataset_meta is not None:
+            if (run := training_run()) is not None:
+                config.require_averaged_checkpoints(run)
             data = adopt(config, dataset_meta)
         self.model = model or SafetyModel(config)
         config.validate_features()

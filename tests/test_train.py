@@ -81,6 +81,13 @@ def of_two_processes(root, output_dir, **options):
     )  # fmt: skip
 
 
+OWN_OPTIMIZER = {
+    "use_policy_training_preset": "false", "optimizer.type": "sgd", "scheduler.type": "constant_with_warmup",
+    "scheduler.num_warmup_steps": 0,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("optimizer", [{}, OWN_OPTIMIZER], ids=["preset", "own"])
 @pytest.mark.parametrize(
     ("steps", "save_freq", "apart", "says"),
     [
@@ -88,8 +95,8 @@ def of_two_processes(root, output_dir, **options):
         (8, 3, 4, "--save_freq is 3, and with --policy.local_updates=4 .* give --save_freq=4"),
     ],
 )
-def test_no_checkpoint_is_saved_between_two_averages(cache_root, tmp_path, steps, save_freq, apart, says):
-    options = {"steps": steps, "save_freq": save_freq, "policy.local_updates": apart}
+def test_no_checkpoint_is_saved_between_two_averages(cache_root, tmp_path, steps, save_freq, apart, says, optimizer):
+    options = {**optimizer, "steps": steps, "save_freq": save_freq, "policy.local_updates": apart}
     with pytest.raises(ValueError, match=says):
         lerobot_train(*of_two_processes(cache_root, tmp_path / "out", **options))
     assert not (tmp_path / "out" / "checkpoints").exists()

@@ -5,6 +5,7 @@ import socket
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,6 @@ from lerobot_latentsafe.runtime.distributed import world_size
 from lerobot_latentsafe.runtime.malloc import keep_freed_memory
 from lerobot_latentsafe.training import encoded_starts, load_with_cache
 
-TASKS = ("world_model", "world_model_apart", "reachability", "reachability_2048", "reachability_apart")
 LOCAL_UPDATES = 8
 """Of ranks that learn apart."""
 TEAMS = {"one": 1, "two": 2, "two_alone": 2}
@@ -100,6 +100,16 @@ def reachability_steps(work: Work, batch_size: int | None = None, local_updates:
     return learn
 
 
+TASKS: dict[str, Callable[[Work], Callable[[], int]]] = {
+    "world_model": training_steps,
+    "world_model_apart": partial(training_steps, local_updates=LOCAL_UPDATES),
+    "reachability": reachability_steps,
+    "reachability_2048": partial(reachability_steps, batch_size=2048),
+    "reachability_apart": partial(reachability_steps, local_updates=LOCAL_UPDATES),
+}
+"""Task -> what prepares it."""
+
+
 def metadata(work: Work) -> LeRobotDatasetMetadata:
     """Of the cached dataset."""
     return LeRobotDatasetMetadata("local/cache", root=work.cache)
@@ -112,13 +122,7 @@ def process(orders: Connection, work: Work, team: str, rank: int, port: int) -> 
     keep_freed_memory()
     if team == "two":
         dist.init_process_group("gloo", init_method=f"tcp://127.0.0.1:{port}", rank=rank, world_size=2)
-    tasks = {
-        "world_model": training_steps(work),
-        "world_model_apart": training_steps(work, LOCAL_UPDATES),
-        "reachability": reachability_steps(work),
-        "reachability_2048": reachability_steps(work, 2048),
-        "reachability_apart": reachability_steps(work, local_updates=LOCAL_UPDATES),
-    }
+    tasks = {task: prepared(work) for task, prepared in TASKS.items()}
     orders.send(0)
     while (task := orders.recv()) is not None:
         orders.send(tasks[task]())
