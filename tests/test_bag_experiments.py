@@ -69,6 +69,7 @@ def script(monkeypatch):
 
     monkeypatch.setattr(runs, "STEPS", STEPS)
     monkeypatch.setattr(policies, "STEPS", STEPS)
+    monkeypatch.setattr(policies, "MIXED_STEPS", STEPS)
     monkeypatch.setattr(SceneWorld, "observe", observe_state)
     monkeypatch.setattr(runs, "BagScene", partial(BagScene, image_size=32))
     runs.bag_scene.cache_clear()

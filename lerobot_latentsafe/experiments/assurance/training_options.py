@@ -89,7 +89,7 @@ def jobs_of(settings: list[FilterSetting | None], drivers: Drivers, n: int) -> d
             jobs.setdefault(who, []).extend({"operator": who, "filter": filter, **start} for start in starts)
         for who, path in drivers.policies.items():
             if drivers.place == "bag":
-                more = [{**policies.as_policy_job(path, setting), **start} for start in starts]
+                more = [{**policies.as_policy_job(who, path, setting), **start} for start in starts]
             else:
                 made_of = {"env": drivers.place, "base": path, "base_fingerprint": fingerprint(path)}
                 more = [{**made_of, "filter": filter, "seed": FIRST_SEED, "n": n}]

@@ -11,13 +11,14 @@ from lerobot_latentsafe.experiments.bag.runs import FIRST_SEED, bag_scene, drive
 from lerobot_latentsafe.experiments.filter_settings import FilterSetting, as_job, fingerprint, in_use
 from lerobot_latentsafe.reports.figures import save, severity, write_side_by_side
 
-STEPS = 150
-"""Policies take their time: one that learned to correct itself grasps after 4 to 9 s."""
+STEPS, MIXED_STEPS = 150, 225
+"""Policies take their time: one that learned to correct itself grasps after 4 to 9 s. The mixed one may grasp twice."""
 
 
-def as_policy_job(base: str, setting: FilterSetting | None) -> dict:
+def as_policy_job(who: str, base: str, setting: FilterSetting | None) -> dict:
     """All that a run depends on but its seed."""
-    return {"steps": STEPS, "base": base, "base_fingerprint": fingerprint(base), "filter": as_job(setting)}
+    steps = MIXED_STEPS if who == "mixed" else STEPS
+    return {"steps": steps, "base": base, "base_fingerprint": fingerprint(base), "filter": as_job(setting)}
 
 
 def run(job: dict, frames: list[np.ndarray] | None = None) -> dict:
@@ -25,7 +26,7 @@ def run(job: dict, frames: list[np.ndarray] | None = None) -> dict:
     policy, scene = load(FilterSetting.from_job(job["filter"]), job["base"]), bag_scene()
     scene.reset(job["seed"])
     torch.manual_seed(job["seed"])  # a diffusion policy samples
-    return drive(scene, policy, frames=frames, n_steps=STEPS)
+    return drive(scene, policy, frames=frames, n_steps=job["steps"])
 
 
 def film(name: str, bare: dict, shielded: dict, folder: Path) -> Path:
@@ -59,7 +60,7 @@ def compare_policies(
         output: of the table, .json.
         n_videos: starts to film.
     """
-    cells = {(who, setting): as_policy_job(bases[who], setting) for who in bases for setting in (None, *settings)}
+    cells = {(who, setting): as_policy_job(who, bases[who], setting) for who in bases for setting in (None, *settings)}
     runs, made_by = run_cells(output, cells, n, run, workers)
     n_candies = bag_scene().n_candies
     table = {who: tabulate(runs[who, None], {s: runs[who, s] for s in settings}, n_candies) for who in bases}
