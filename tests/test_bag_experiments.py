@@ -4,7 +4,7 @@ import importlib.util
 import json
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -138,6 +138,15 @@ def encoder(tmp_path):
     return tiny.save_dino(tmp_path / "dino") if importlib.util.find_spec("transformers") else "efficientnet_lite0"
 
 
+class InThisThread(ThreadPoolExecutor):
+    """A scene that drew in one thread cannot be closed in another."""
+
+    def submit(self, function, /, *arguments):
+        done = Future()
+        done.set_result(function(*arguments))
+        return done
+
+
 def test_the_demo_trains_a_filter_that_sees_by_an_encoder(script, base_path, encoder, tmp_path, monkeypatch):
     """All of its commands, in this process, on episodes of a second."""
 
@@ -160,7 +169,7 @@ def test_the_demo_trains_a_filter_that_sees_by_an_encoder(script, base_path, enc
     monkeypatch.setattr(Demo, "run", run)
     monkeypatch.setitem(SCENES, "bag", replace(SCENES["bag"], episode_seconds=4.0, image_size=56))
     monkeypatch.setattr(demo_filter, "SOURCES", ("bag_mix", "bag_lifts"))
-    monkeypatch.setattr(demo, "ThreadPoolExecutor", lambda n: ThreadPoolExecutor(1))
+    monkeypatch.setattr(demo, "ThreadPoolExecutor", InThisThread)
     size = 2 * load_encoder(encoder).patch
     options = [f"--out={tmp_path / 'demo'}", f"--encoder={encoder}", "--episodes=2", "--n=1", f"--base={base_path}"]
     script("demo_bag", *options, f"--image_size={size}", "--steps=2", "--critic_steps=3")
