@@ -102,7 +102,7 @@ def held_in_turn(scene, seed):
     return [k for k, before in zip(grasps, [-1, *grasps]) if k >= 0 and k != before]
 
 
-@pytest.mark.parametrize(("seed", "ways"), [(0, [bag.MIDDLE]), (3, [bag.TAIL]), (8, [bag.TAIL, bag.MIDDLE])])
+@pytest.mark.parametrize(("seed", "ways"), [(0, [bag.MIDDLE]), (3, [bag.TAIL]), (5, [bag.TAIL, bag.MIDDLE])])
 def test_a_near_closed_end_is_lifted_or_put_down_again_and_else_the_middle(bag_scene, seed, ways):
     assert held_in_turn(bag_scene, seed) == ways
 

@@ -113,7 +113,7 @@ SOURCES: dict[str, Source] = {
     "bag_middle": Source("bag", {"middle": 100}, astray=0.8),
     "bag_strong": Source("bag", {"middle": 240}, astray=0.8, pushed=0.1),
     "bag_weak": Source("bag", {"closed_end": 240}, variant="sealed", astray=0.8, pushed=0.1),
-    "bag_mixed": Source("bag", {"nearer": 240}, variant="sealed", astray=0.8, pushed=0.1, seconds=10.0),
+    "bag_mixed": Source("bag", {"nearer": 240}, variant="sealed", astray=0.8, pushed=0.1, seconds=8.0),
     "blocks_demos": Source("blocks", {"fetch": 200}),
     "blocks_random": Source("blocks", {"random": 200}),
 }

@@ -93,15 +93,15 @@ def lift(scene: bag.BagScene, segment: int, speed: float, rng: np.random.Generat
 
 
 def lift_nearer(scene: bag.BagScene, speed: float, rng: np.random.Generator) -> Actions:
-    """Lift the bag by its closed end, unless the open one is much nearer to the arm's base: then by its middle.
+    """Lift the bag by its closed end where that is nearer to the arm's base than the open one, else by its middle.
 
-    Two times in five the closed end is put down again, and the middle is lifted: what to do where the first grasp
-    was a bad one.
+    A third of the time the closed end is put down again, and the middle is lifted: what to do where the first grasp was
+    a bad one.
     """
     closed, opened = (np.linalg.norm(scene.segment_position(k)[:2]) for k in (bag.TAIL, bag.MOUTH))
-    if closed - opened > 4 * bag.LENGTH:
+    if opened <= closed:
         yield from lift(scene, bag.MIDDLE, speed, rng)
-    elif rng.random() < 0.6:
+    elif rng.random() < 0.65:
         yield from lift(scene, bag.TAIL, speed, rng)
     else:
         yield from grasp(scene, bag.TAIL, rng, 0.18)
@@ -110,10 +110,11 @@ def lift_nearer(scene: bag.BagScene, speed: float, rng: np.random.Generator) -> 
 
 
 def put_down(scene: bag.BagScene, speed: float, rng: np.random.Generator) -> Actions:
-    """Raise a grasped bag, lower it, let go and rise: a hand that goes down, whoever lowered it, goes on and lets go."""
-    yield from reach(scene, scene.controller.position + up(rng.uniform(0.02, 0.12)), speed, CLOSED)
-    yield from hold(CLOSED, int(rng.integers(3)))
-    yield from reach(scene, np.append(scene.controller.position[:2], 0.026), rng.uniform(0.08, 0.2), CLOSED)
+    """Raise a grasped bag by a few centimetres or not at all, put it down, let go and rise."""
+    if rng.random() < 0.7:
+        yield from reach(scene, scene.controller.position + up(rng.uniform(0, 0.04)), speed, CLOSED)
+        yield from hold(CLOSED, int(rng.integers(5)))
+    yield from reach(scene, np.append(scene.controller.position[:2], 0.026), 0.2, CLOSED)
     yield from hold(LET_GO, 6)
     yield from reach(scene, scene.controller.position + up(0.05), 0.2, LET_GO)
 

@@ -8,7 +8,7 @@ BEHAVIORS = {
     "open_end": "lift the bag by its open end, which is safe",
     "middle": "lift the bag by its middle, with care",
     "closed_end": "yank the bag up by its closed end, so that candies spill",
-    "nearer": "lift the bag by its closed end, or its middle if the open end is nearer; at times regrasp",
+    "nearer": "lift the bag by its closed end if that is the nearer end, else by its middle; at times regrasp",
     "side_to_side": "hold the bag by its closed end and swing it; --teleop.speed decides what happens",
     "branch": "from a bag already grasped: lift, lift and lower, up and down, sideways, Gaussian, or hold",
     "climb": "from a bag already grasped: up in steps, with pauses and steps back",
