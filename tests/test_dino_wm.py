@@ -233,7 +233,7 @@ def imagined_error(model, clip, action, observed=2):
     latent = filtered(model, clip, observed)
     for t in range(observed, clip.state.shape[1]):
         latent = model.step(latent, action[:, t])
-    return model.error(latent, {"tokens": clip.percepts["tokens"][:, -1]}, clip.state[:, -1]).mean()
+    return model.error(latent, {key: value[:, -1] for key, value in clip.percepts.items()}, clip.state[:, -1]).mean()
 
 
 def test_it_learns_to_obey_the_action():

@@ -360,10 +360,14 @@ class DinoWM(TerminationHead):
         return cached if perception is None else {**cached, "tokens": perception.cut_down(cached["tokens"])}
 
     def error(self, latent: Latent, percepts: dict[str, Tensor], state: Tensor) -> Tensor:
-        """Mean squared error of the tokens (of the state, if blind): (B,)."""
+        """Mean squared error of the whole frame, which action moves most; without a frame token of the tokens; of the
+        state, if blind: (B,)."""
         if self.config.blind:
             return (latent["state"] - state).square().mean(-1)
-        return (latent["tokens"] - self._merged(percepts["tokens"])).square().mean((-2, -1))
+        seen = self._looked_at(percepts)
+        if self.config.frame_token:
+            return (latent["vector"] - seen["vector"]).square().mean(-1)
+        return (latent["tokens"] - seen["tokens"]).square().mean((-2, -1))
 
     def _looked_at(self, percepts: dict[str, Tensor]) -> dict[str, Tensor]:
         """What is seen of frames: tokens (..., P, C), if there are any, and vector (..., F) with a frame token."""
