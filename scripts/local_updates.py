@@ -26,7 +26,7 @@ import torch
 from lerobot_latentsafe.dubins.ground_truth import exact_value
 from lerobot_latentsafe.evaluation.statistics import confusion, provenance, write_json
 from lerobot_latentsafe.experiments.demo import ENVIRONMENT, in_16_bits
-from lerobot_latentsafe.experiments.dubins.demo import CANDIDATES, FEW, WORLD_MODEL_STEPS
+from lerobot_latentsafe.experiments.dubins.demo import WORLD_MODEL_STEPS, world_model_options
 from lerobot_latentsafe.experiments.dubins.monitor import LatentMonitor
 from lerobot_latentsafe.modeling_latentsafe import load_filter
 from lerobot_latentsafe.safety_model import SafetyModel
@@ -53,12 +53,12 @@ def balanced_accuracy(demo: Path, margin: Path, variant: str, seed: int, steps: 
         return of_the_critic(load_filter(critic).model, np.load(demo / "states.npy"))
 
 
-def world_model_apart(demo: Path, seed: int, folder: Path) -> Path:
+def world_model_apart(demo: Path, folder: Path) -> Path:
     """The margin on a world model that two processes train apart, by half batches, otherwise as the demonstration's."""
+    (seed,) = json.loads((demo / "metrics.json").read_text())["seeds"]
     run(
         *TWO, "-m", "lerobot.scripts.lerobot_train", "--config_path=configs/dubins_rssm.yaml", *recordings(demo),
-        f"--policy.frame_cache={demo / 'random_cache'}", f"--policy.fallback.action_candidates={CANDIDATES}",
-        f"--steps={WORLD_MODEL_STEPS}", f"--policy.scheduler_steps={WORLD_MODEL_STEPS}", *FEW, "--batch_size=8",
+        *world_model_options(str(demo / "random_cache")), "--batch_size=8",
         f"--policy.local_updates={LOCAL_UPDATES}", f"--seed={seed}", f"--output_dir={folder / 'world_model'}",
         environment=dict(setting.split("=") for setting in in_16_bits()[1:]),
     )  # fmt: skip
@@ -111,16 +111,16 @@ def run(*options: str, environment: Mapping[str, str] | None = None) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--demos", type=Path, nargs="+", required=True, help="of seeds 0, 1, ...")
+    parser.add_argument("--demos", type=Path, nargs="+", required=True, help="folders that scripts/demo.py wrote")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
     parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--output", type=Path, default=Path("results/scale/local_updates.json"))
     given = parser.parse_args()
     began = os.times()
     rows: dict[str, list[float]] = {variant: [] for variant in (*VARIANTS, WORLD_MODEL)}
-    for n, demo in enumerate(given.demos):
+    for demo in given.demos:
         with TemporaryDirectory() as folder:
-            apart = world_model_apart(demo, n, Path(folder))
+            apart = world_model_apart(demo, Path(folder))
             for seed in given.seeds:
                 for variant, found in rows.items():
                     margin, critic = (apart, "one") if variant == WORLD_MODEL else (demo / "margin", variant)

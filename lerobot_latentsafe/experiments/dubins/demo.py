@@ -54,6 +54,14 @@ USUAL_MINUTES = {
 """Of CPU time, about, for the progress bar."""
 
 
+def world_model_options(root: str) -> tuple[str, ...]:
+    """Of lerobot-train, beside its configuration, for a world model of cached random episodes at a path."""
+    return (
+        f"--policy.frame_cache={root}", f"--policy.fallback.action_candidates={CANDIDATES}",
+        f"--steps={WORLD_MODEL_STEPS}", f"--policy.scheduler_steps={WORLD_MODEL_STEPS}", *FEW,
+    )  # fmt: skip
+
+
 class DubinsDemo(Demo):
     """The car's road from episodes to a shielded policy.
 
@@ -96,10 +104,8 @@ class DubinsDemo(Demo):
         root, margin, critic = self.data("random", N_RANDOM), f"{self.out}/margin", f"{self.out}/critic"
         cached = "--dataset.repo_id=demo/random_cache", f"--dataset.root={root}"
         checkpoint = self.train(
-            "world model", "dubins_rssm", "random", root, f"--policy.frame_cache={root}",
-            f"--policy.fallback.action_candidates={CANDIDATES}", f"--steps={WORLD_MODEL_STEPS}",
-            f"--policy.scheduler_steps={WORLD_MODEL_STEPS}", *FEW, before=in_16_bits(),
-        )  # fmt: skip
+            "world model", "dubins_rssm", "random", root, *world_model_options(root), before=in_16_bits()
+        )
         self.run(  # anew, for that one tells a sure margin from a surer one, by which a fallback is chosen
             "fit the failure margin",
             *("latentsafe", "train-margin", f"--policy.path={checkpoint}", *cached),
