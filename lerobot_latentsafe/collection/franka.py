@@ -20,7 +20,7 @@ from lerobot_latentsafe.datasets.labels import FAILING, SAFE
 from lerobot_latentsafe.evaluation.rollouts import Choice, Step, steps
 from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES, action_limits, read_action
 from lerobot_latentsafe.franka.bag import BagScene, varied
-from lerobot_latentsafe.franka.behaviors import GRASPED, grasp, stray
+from lerobot_latentsafe.franka.behaviors import GRASPED, grasp, lower, stray
 from lerobot_latentsafe.franka.scenes import CLUMSINESS, HELD_ANYWHERE, SCENES
 from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
 from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
@@ -113,7 +113,15 @@ SOURCES: dict[str, Source] = {
     "bag_middle": Source("bag", {"middle": 100}, astray=0.8),
     "bag_strong": Source("bag", {"middle": 240}, astray=0.8, pushed=0.1),
     "bag_weak": Source("bag", {"closed_end": 240}, variant="sealed", astray=0.8, pushed=0.1),
-    "bag_mixed": Source("bag", {"nearer": 240}, variant="sealed", astray=0.8, pushed=0.1, seconds=8.0),
+    "bag_mixed": Source(
+        "bag",
+        {"nearer": 170, "regrasp": 90},
+        variant="sealed",
+        astray=0.8,
+        pushed=0.1,
+        seconds=8.0,
+        grasps=(0.6, 0.15, 0, 0.25, 0, 0, 0),
+    ),
     "blocks_demos": Source("blocks", {"fetch": 200}),
     "blocks_random": Source("blocks", {"random": 200}),
 }
@@ -240,9 +248,11 @@ def _begin(robot: LatentSafeFrankaMujoco, source: Source, episode: int, scene_se
     if source.branches:
         n_frames -= _grasp(robot, scene_seed, source)
     rng = np.random.default_rng([8, scene_seed])
-    if rng.random() < source.astray:
-        bag: BagScene = scene
-        _go(robot, stray(bag, GRASPED[source.behavior(episode)], rng))
+    if source.behavior(episode) == "regrasp":
+        _grasp(robot, scene_seed, source)
+        _go(robot, lower(scene, rng))
+    elif rng.random() < source.astray:
+        _go(robot, stray(scene, GRASPED[source.behavior(episode)], rng))
     return _pushes(source.pushed / info.fps, n_frames, rng)
 
 
