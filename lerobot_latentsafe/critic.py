@@ -109,6 +109,8 @@ class ReachabilityConfig:
         pool: imagined states kept; a part is imagined anew every `refresh` steps.
         greedy: share of imagined trajectories that follow the current fallback policy, which lets imagination visit
             what the fallback would see; the others act at random, each action held for 1 / `switch` steps on average.
+        recorded: share of imagined trajectories that go on as their recording did, whatever they would try: imagination
+            then visits what the policies of the data do, among them the one to be shielded. What was tried is learned.
         kept: of configurations before 0.2, which are refused: LeRobot's commands read this group of them first.
     """
 
@@ -136,6 +138,7 @@ class ReachabilityConfig:
     refresh: int = 250
     greedy: float = 0.5
     switch: float = 0.1
+    recorded: float = 0.0
     kept: int | None = None
 
     def __post_init__(self) -> None:
@@ -148,6 +151,8 @@ class ReachabilityConfig:
             raise ValueError(f"actor_through is {self.actor_through!r}; expected critic or world_model")
         if not 0 <= self.hinge < math.inf:
             raise ValueError(f"--policy.reachability.hinge is {self.hinge}; expected a weight, 0 or more")
+        if not 0 <= self.recorded <= 1:
+            raise ValueError(f"--policy.reachability.recorded is {self.recorded}; expected a share, 0 to 1")
         if self.local_updates < 1:
             raise ValueError(f"--policy.reachability.local_updates is {self.local_updates}; expected at least 1")
 

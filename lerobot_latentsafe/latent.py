@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 
 Latent = dict[str, Tensor]
+FRAME = "frame"
+"""In latents of recordings: which frame each is of, where that is asked for."""
 
 ABSURD = 1e3
 """Larger numbers than this mean nothing: those of trained models stay within a few tens."""
@@ -34,6 +36,19 @@ def is_sound(tensors: Latent) -> Tensor:
     """Whether a batch of latents, or of percepts, holds what a model can mean: finite, no number absurd. Bool (B,)."""
     # NaN is not at most anything.
     return torch.stack([(t.abs() <= ABSURD).reshape(len(t), -1).all(1) for t in tensors.values()]).all(0)
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What recordings of N frames did.
+
+    Attributes:
+        action: (N, K A), the actions of the ticks from each frame to that of the next step, side by side.
+        following: (N,), which frame that is.
+    """
+
+    action: Tensor
+    following: Tensor
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from lerobot_latentsafe.critic import HINGE_ABOVE, ReachabilityConfig, SafetyCritic, safety_bellman_target
-from lerobot_latentsafe.latent import Latent, map_latent, replace_rows, select
+from lerobot_latentsafe.latent import FRAME, Latent, Recorded, map_latent, replace_rows, select
 from lerobot_latentsafe.runtime.distributed import (
     any_rank,
     average_over_ranks,
@@ -41,6 +41,9 @@ class Imagination(Protocol):
 
     def step(self, latent: Latent, action: Tensor) -> Latent:
         """Next latent under actions (B, A) in [-1, 1]."""
+
+    def follow(self, latent: Latent, actions: Tensor) -> Latent:
+        """Next latent under the actions of a step's ticks, side by side (B, K A)."""
 
     def features(self, latent: Latent) -> Tensor:
         """(B, D), what actor and critic read."""
@@ -118,13 +121,14 @@ class LatentReachability:
 
     Args:
         succeeding: (M, D), features of latents from which a recorded episode went on to succeed, for the hinge.
+        recorded: what the recordings did, where a share of trajectories goes on like them; starts then hold `FRAME`.
     """
 
     def __init__(
         self, imagination: Imagination, critic: SafetyCritic, starts: Starts, config: ReachabilityConfig,
-        generator: torch.Generator | None = None, succeeding: Tensor | None = None,
+        generator: torch.Generator | None = None, succeeding: Tensor | None = None, recorded: Recorded | None = None,
     ):  # fmt: skip
-        self.succeeding = succeeding
+        self.succeeding, self.recorded = succeeding, recorded
         self.imagination, self.critic, self.starts, self.config = imagination, critic, starts, config
         self.generator = generator
         self.target = copy.deepcopy(critic).requires_grad_(False)
@@ -151,8 +155,9 @@ class LatentReachability:
             are continuous; and what `_add_outcomes` says of the rest of the trajectory.
         """
         critic, config = self.critic, self.config
-        latent = self.starts(self.chunk)
+        latent, frame = self._start()
         greedy = self._rand() < config.greedy
+        as_recorded = None if self.recorded is None else self._rand() < config.recorded
         held, n = self._random_actions(), len(greedy)
         rows: list[dict[str, Tensor]] = []
         for t in range(config.horizon):
@@ -180,18 +185,30 @@ class LatentReachability:
                 }
             )
             taken = torch.arange(n, device=x.device) * k + choice
-            latent = select(after, taken)
-            if any_rank(ended[taken].any()):
-                latent = replace_rows(latent, self.starts(self.chunk), where=ended[taken])
-        self._add_outcomes(rows)
+            before, latent, over = latent, select(after, taken), ended[taken]
+            if self.recorded is not None:
+                followed = self.imagination.follow(before, self.recorded.action[frame])
+                latent, frame = replace_rows(latent, followed, where=as_recorded), self.recorded.following[frame]
+                over = self.imagination.ended(latent)
+            if any_rank(over.any()):
+                fresh, at = self._start()
+                latent, frame = replace_rows(latent, fresh, where=over), torch.where(over, at, frame)
+        self._add_outcomes(rows, as_recorded)
         columns = {key: torch.stack([row[key] for row in rows[: self.learned_steps]], 1) for key in rows[0]}
         return {key: gathered(column).transpose(0, 1).flatten(0, 1) for key, column in columns.items()}
 
+    def _start(self) -> tuple[Latent, Tensor]:
+        """Latents (n,) from which trajectories start, and which frame each is; 0 where that was not asked for."""
+        latent = dict(self.starts(self.chunk))
+        n = len(next(iter(latent.values())))
+        return latent, latent.pop(FRAME, torch.zeros(n, dtype=torch.long, device=self.critic.feature_mean.device))
+
     @staticmethod
-    def _add_outcomes(rows: list[dict[str, Tensor]]) -> None:
+    def _add_outcomes(rows: list[dict[str, Tensor]], as_recorded: Tensor | None = None) -> None:
         """What came of each action taken: the worst margin until the trajectory's end, and the latent it ended in.
 
-        Adds worst (N,), end_x (N, C) and end_over (N,): whether the episode was over there.
+        Adds worst (N,), end_x (N, C) and end_over (N,): whether the episode was over there. Nothing is known of what
+        was tried where the trajectory went on `as_recorded` (N,): the worst is then the least margin there is.
         """
         later: dict[str, Tensor] | None = None
         for row in reversed(rows):
@@ -204,6 +221,8 @@ class LatentReachability:
                 row["end_x"] = torch.where(over[:, None], x, later["end_x"])
                 row["end_over"] = over | later["end_over"]
             later = row
+        for row in rows if as_recorded is not None else []:
+            row["worst"] = torch.where(as_recorded, -1.0, row["worst"])
 
     def _random_actions(self) -> Tensor:
         """(n, A): the index of a candidate in the first column, or an action if they are continuous."""

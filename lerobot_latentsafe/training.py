@@ -26,7 +26,7 @@ from lerobot_latentsafe.datasets.adoption import adopt_dataset
 from lerobot_latentsafe.datasets.clips import ClipReader, FilterData
 from lerobot_latentsafe.datasets.fingerprints import episode_marks, with_episodes
 from lerobot_latentsafe.datasets.labels import read_frames
-from lerobot_latentsafe.latent import Latent, map_latent, select
+from lerobot_latentsafe.latent import FRAME, Latent, map_latent, select
 from lerobot_latentsafe.margin import FailureMargin, MarginConfig, hinge_loss, slope_between
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
 from lerobot_latentsafe.reachability import LatentReachability, Starts
@@ -185,13 +185,14 @@ def trained_on_too(policy: LatentSafePolicy, reader: ClipReader) -> TrainedOn:
 
 @torch.no_grad()
 def encoded_starts(
-    model: SafetyModel, reader: ClipReader, generator: torch.Generator, max_frames: int = 100_000
+    model: SafetyModel, reader: ClipReader, generator: torch.Generator, max_frames: int = 100_000, told: bool = False
 ) -> Starts:
     """Where imagination starts: encodings of random dataset windows, half of a single frame, half of a history.
 
     Args:
         generator: draws both the windows and the starts.
         max_frames: frames encoded at most; fewer where their latents would not fit in `STARTS_BYTES`.
+        told: latents hold which `FRAME` each is.
 
     Returns:
         A sampler of latents. Several ranks encode a share each and gather all.
@@ -205,14 +206,18 @@ def encoded_starts(
     first = first[torch.randperm(len(first), generator=generator)[: max(1, max_frames // length)].numpy()]
     single, filtered = [], []
     first = share(torch.from_numpy(first)).numpy()
+    reads = numbered(reader) if told else reader
     for chunk in np.array_split(first, max(1, len(first) // 64)):
-        clip = reader.cut(chunk, world_model)
+        clip = reads.cut(chunk, world_model)
         kept = clip.valid.flatten()
         z = world_model.encode(clip)
         filtered.append(select({k: v.flatten(0, 1) for k, v in z.items()}, kept))
         percepts = {k: v.flatten(0, 1)[kept] for k, v in clip.percepts.items()}
         before = units.first_action(clip.action.flatten(0, 1)[kept])
         single.append(world_model.observe(None, before, percepts, clip.state.flatten(0, 1)[kept]))
+        if told:
+            frame = {FRAME: clip.failure.flatten()[kept]}
+            filtered[-1], single[-1] = {**filtered[-1], **frame}, {**single[-1], **frame}
     pool: Latent = {
         k: torch.cat([gathered(torch.cat([z[k] for z in part])) for part in (single, filtered)]) for k in single[0]
     }
@@ -309,7 +314,8 @@ def learn_critic(
     require_at_least("--policy.reachability.steps", model.config.reachability.steps, 1)
     model.world_model.requires_grad_(False)
     model.margin.requires_grad_(False)
-    starts, known = encoded_starts(model, reader, generator), {}
+    goes_on = model.config.reachability.recorded > 0
+    starts, known = encoded_starts(model, reader, generator, told=goes_on), {}
     if numbers is not None:
         features, frame = seen_and_imagined(model, numbered(reader), model.config.margin.clips, generator)
         likeness, places = learn_likeness(model.likeness, likeness, numbers, features, frame, generator)
@@ -320,8 +326,9 @@ def learn_critic(
         features, frame = seen_and_imagined(model, numbered(reader), model.config.margin.clips, generator)
         succeeding = features[torch.from_numpy(succeeds)[frame]]
     learner = LatentReachability(
-        model.imagination, model.critic, starts, model.config.reachability, succeeding=succeeding
-    )
+        model.imagination, model.critic, starts, model.config.reachability, succeeding=succeeding,
+        recorded=reader.recorded() if goes_on else None,
+    )  # fmt: skip
     progress = trange(model.config.reachability.steps, desc="reachability", unit="step", disable=rank() > 0)
     for step in progress:
         metrics = learner.update()

@@ -155,6 +155,21 @@ def test_every_third_frame_is_led_to_by_three_actions(counting_root, tmp_path, c
     assert (clip.action[:, 0] == 0).all()
 
 
+def test_what_was_done_after_each_frame_stays_in_its_episode(counting_root):
+    read = reading(counting_root, frame_skip=3, clip_length=4)
+    recorded, units, end = read.policy.reader.recorded(), read.policy.model.units, int(FIRST[1])
+    taken = units.denormalise_action(recorded.action.view(N, 3, 2))[..., 0]
+    for frame, ticks, following in (
+        (0, [0, 1, 2], 3),
+        (end - 4, [end - 4, end - 3, end - 2], end - 1),
+        (end - 2, [end - 2, end - 1, end - 1], end - 2),
+        (end, [end, end + 1, end + 2], end + 3),
+        (N - 1, [N - 1] * 3, N - 1),
+    ):
+        np.testing.assert_allclose(taken[frame], [100 + t for t in ticks], atol=1e-4)
+        assert recorded.following[frame] == following
+
+
 def test_a_failure_between_two_frames_counts(counting_root, tmp_path):
     build_frame_cache(LeRobotDataset("me/counting", root=counting_root), tmp_path / "cache", 8)
     reader = reading(tmp_path / "cache", frame_skip=3, clip_length=3).policy.reader

@@ -128,6 +128,7 @@ def test_a_robot_behind_an_old_filter_is_refused(verb, tmp_path):
 SINCE_0_3_OF_THE_LAW = [("law", name) for name in ("slack_ms", "unknown", "kappa", "replan_above", "engine")]
 SINCE_0_3_OF_TRAINING = [
     ("margin", "noise"), ("margin", "gradient_penalty"), ("reachability", "hinge"), ("reachability", "local_updates"),
+    ("reachability", "recorded"),
 ]  # fmt: skip
 
 

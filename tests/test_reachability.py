@@ -13,6 +13,7 @@ from lerobot_latentsafe.dubins.ground_truth import exact_value
 from lerobot_latentsafe.evaluation.statistics import confusion
 from lerobot_latentsafe.experiments.dubins.monitor import PrivilegedMonitor
 from lerobot_latentsafe.experiments.dubins.privileged import DubinsImagination, train_privileged
+from lerobot_latentsafe.latent import FRAME, Recorded
 from lerobot_latentsafe.reachability import LatentReachability, discount, look_ahead
 
 MARGIN, NEXT = torch.tensor([0.5, 0.5, -0.2]), torch.tensor([0.1, 0.9, 0.3])
@@ -30,6 +31,8 @@ class WindyChain:
         x = latent["x"]
         wind = torch.where(x < self.threshold, -1.0, 0.0)
         return {"x": (x + 0.1 * (wind + 0.5 * action)).clamp(-1, 1)}
+
+    follow = step
 
     def features(self, latent):
         return latent["x"]
@@ -179,6 +182,27 @@ def test_where_recordings_succeed_a_hinge_raises_v_and_lowers_none(candidates):
 def test_a_hinge_that_is_none_is_refused(hinge):
     with pytest.raises(ValueError, match=r"--policy.reachability.hinge is .*a weight, 0 or more"):
         ReachabilityConfig(hinge=hinge)
+
+
+@pytest.mark.parametrize("candidates", [torch.tensor([[-1.0], [1.0]]), None], ids=["discrete", "continuous"])
+def test_trajectories_go_on_as_recorded_and_learn_of_what_was_tried(candidates):
+    config = tiny.reachability_config(recorded=1.0, horizon=4, learned_steps=4)
+    critic = SafetyCritic(1, 1, candidates, config)
+    recorded = Recorded(torch.tensor([[1.0], [-1.0], [0.0]]), torch.tensor([1, 2, 2]))
+    start = lambda n: {"x": torch.full((n, 1), 0.6), FRAME: torch.zeros(n, dtype=torch.long)}  # noqa: E731
+    learner = LatentReachability(WindyChain(), critic, start, config, recorded=recorded)
+    visited = learner.pool["x"] / critic.projection + critic.feature_mean
+    torch.testing.assert_close(visited.view(4, -1)[:, 0], torch.tensor([0.6, 0.65, 0.6, 0.6]))
+    tried = learner.pool["action"] if candidates is None else candidates.T.expand(len(visited), -1)
+    torch.testing.assert_close(learner.pool["next_l"], visited + 0.05 * tried)
+    assert (learner.pool["worst"] == -1).all()  # what was tried and not done bounds nothing
+    assert math.isfinite(learner.update()["critic_loss"])
+
+
+@pytest.mark.parametrize("recorded", [-0.1, 1.1, float("nan")])
+def test_a_share_as_recorded_that_is_none_is_refused(recorded):
+    with pytest.raises(ValueError, match=r"--policy.reachability.recorded is .*a share, 0 to 1"):
+        ReachabilityConfig(recorded=recorded)
 
 
 def test_fewer_than_one_local_update_are_refused():

@@ -129,6 +129,14 @@ def test_a_configuration_without_steps_makes_no_critic(tiny_world_model, cache_m
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("other", [{}, {"target": "risk"}, {"alike": {"heading_cos.pos": 1.0}}], ids=str)
+def test_a_critic_that_visits_what_was_recorded_is_trained(tiny_world_model, cache_meta, tmp_path, other):
+    folder = shutil.copytree(tiny_world_model, tmp_path / "model")
+    tiny.rewrite_group(folder, "reachability", recorded=0.5)
+    policy = train_reachability(folder, cache_meta, tmp_path / "out", **other)
+    assert policy.config.reachability.recorded == 0.5 and policy.config.trained_on.stage == "critic"
+
+
 @pytest.fixture
 def hinged(tiny_world_model, tmp_path):
     """A filter after stage 1, whose critic is to heed what succeeds."""

@@ -14,6 +14,7 @@ from lerobot_latentsafe.datasets.contract import Contract
 from lerobot_latentsafe.datasets.frame_cache import FOLDER, FrameCache, FrameCacheError
 from lerobot_latentsafe.datasets.labels import FailureLabels
 from lerobot_latentsafe.datasets.renaming import rename_command
+from lerobot_latentsafe.latent import Recorded
 from lerobot_latentsafe.pictures import check_proportions
 from lerobot_latentsafe.units import Units
 
@@ -247,6 +248,18 @@ class ClipReader:
         cached, _ = self.cache.frames(window, eyes.percept_names if eyes else [])
         cached = {key: value.to(self.units.device) for key, value in cached.items()}
         return self._assemble(window, valid, eyes.from_cache(cached) if eyes else {})
+
+    def recorded(self) -> Recorded:
+        """What was done after each frame of the dataset; after an episode's last frame, the same again."""
+        _, of, counts = np.unique(self.labels.episode, return_inverse=True, return_counts=True)
+        frame, last = np.arange(len(of)), (np.cumsum(counts) - 1)[of]
+        ticks = np.minimum(frame[:, None] + np.arange(self.skip), last[:, None])
+        action, state = (torch.from_numpy(column[ticks]).float() for column in (self.action, self.state))
+        device, after = self.units.device, frame + self.skip
+        return Recorded(
+            action=self.units.heard_action(action.to(device), state.to(device)).flatten(-2),
+            following=torch.from_numpy(np.where(after <= last, after, frame)).to(device),
+        )
 
     def _window(self, start: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarray]:
         """Frame indices (B, T) from each start on, and whether they are of its episode; if not, they stay at the last

@@ -1,4 +1,5 @@
-"""What two options of training change: a gradient penalty on the margin, and a hinge on V where recordings succeed.
+"""What options of training change: a gradient penalty on the margin, a hinge on V where recordings succeed, and
+imagination that goes on as was recorded.
 
 Each filter is trained anew on one world model, on the same recordings and seeds, and shields the same drivers from the
 same starts under both laws.
@@ -26,6 +27,7 @@ OPTIONS: dict[str, dict[str, float]] = {
     "gradient penalty": {"gradient_penalty": 0.1},
     "hinge": {"hinge": 1.0},
     "both": {"gradient_penalty": 0.1, "hinge": 1.0},
+    "as recorded": {"recorded": 0.5},
 }
 """Those that are compared."""
 FIRST_SEED = 330_000
@@ -60,7 +62,7 @@ def train(path: str, meta: Any, options: dict[str, float], seed: int, folder: Pa
     law, hinge = config.law, options.get("hinge", 0.0)
     config.change(
         margin=replace(config.margin, gradient_penalty=options.get("gradient_penalty", 0.0)),
-        reachability=replace(config.reachability, hinge=hinge),
+        reachability=replace(config.reachability, hinge=hinge, recorded=options.get("recorded", 0.0)),
         frame_cache=None,
     )
     fit_new_margin(policy.model, reader, torch.Generator().manual_seed(seed))

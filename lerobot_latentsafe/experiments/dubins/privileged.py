@@ -33,6 +33,10 @@ class DubinsImagination:
             )
         }
 
+    def follow(self, latent: Latent, actions: Tensor) -> Latent:
+        """The same: a step has one tick."""
+        return self.step(latent, actions)
+
     def features(self, latent: Latent) -> Tensor:
         """Position, and the heading's cosine and sine: (B, 4)."""
         x, y, heading = latent["state"].unbind(-1)
