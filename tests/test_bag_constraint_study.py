@@ -1,4 +1,4 @@
-"""The study of a new constraint on the bag: the zone, what is marked, one short run, and the table."""
+"""The study of a new constraint on the bag: the places, what is marked, one short run, and the table."""
 
 import json
 from types import SimpleNamespace
@@ -9,8 +9,10 @@ import torch
 
 from lerobot_latentsafe.constraints import LikenessConfig
 from lerobot_latentsafe.experiments.assurance import bag_constraint as study_module
-from lerobot_latentsafe.experiments.assurance.bag_constraint import CASES, LINE, NUMBER, inside, mark, run, study
+from lerobot_latentsafe.experiments.assurance.bag_constraint import CASES, PLACES, mark, run, study
 from lerobot_latentsafe.franka.actions import STATE_NAMES
+
+(NUMBER,), ((LINE, _),) = PLACES["zone"].between.keys(), PLACES["zone"].between.values()
 
 
 def states(x):
@@ -20,7 +22,13 @@ def states(x):
 
 
 def test_the_zone_is_far_from_the_foot():
-    assert inside(states([LINE + 0.01, LINE - 0.01])).tolist() == [True, False]
+    assert PLACES["zone"].holds(states([LINE + 0.01, LINE - 0.01])).tolist() == [True, False]
+
+
+def test_only_what_is_held_can_be_too_high():
+    hand = np.zeros((3, len(STATE_NAMES)))
+    hand[:, [STATE_NAMES.index("ee_z.pos"), STATE_NAMES.index("gripper.pos")]] = [0.25, 0.1], [0.25, 1.0], [0.15, 0.1]
+    assert PLACES["too high"].holds(hand).tolist() == [True, False, False]
 
 
 def test_what_is_marked_lies_in_the_zone(monkeypatch, tmp_path):
@@ -42,25 +50,28 @@ def test_what_is_marked_lies_in_the_zone(monkeypatch, tmp_path):
         likeness=lambda features: features[..., [STATE_NAMES.index(NUMBER)]] / 0.05,
     )
     policy = SimpleNamespace(model=model, config=SimpleNamespace(likeness=LikenessConfig({NUMBER: 0.05})))
-    (prototype,) = mark(policy, tmp_path)["zone"]
+    (prototype,) = mark(policy, tmp_path, PLACES["zone"])
     where, reach = prototype[NUMBER]
     assert where - reach == pytest.approx(LINE, abs=0.02) and where + reach > 0.61
 
 
-def test_a_bare_run_tells_what_became_of_it(monkeypatch):
+@pytest.mark.parametrize("place", PLACES)
+def test_a_bare_run_tells_what_became_of_it(place, monkeypatch):
     monkeypatch.setattr(study_module, "STEPS", 2)
-    ran = run({"constraints": None, "seed": 0})
+    ran = run({"place": place, "constraints": None, "seed": 0})
     assert ran == {"entered": False, "lost": 0, "success": False, "changed": 0}
 
 
 def test_the_table_has_all_cases(monkeypatch, tmp_path):
     loaded = SimpleNamespace(config=SimpleNamespace(law=SimpleNamespace(name="reachability")))
     monkeypatch.setattr(study_module, "loaded", lambda path: loaded)
-    monkeypatch.setattr(study_module, "mark", lambda policy, root: {"zone": []})
+    monkeypatch.setattr(study_module, "mark", lambda policy, root, place: [])
     row = {"entered": True, "lost": 1, "success": False, "changed": 9}
     monkeypatch.setattr(study_module, "run", lambda job: row)
     output = tmp_path / "constraints_bag.json"
     study("filter", tmp_path, 2, output)
     summary = json.loads(output.read_text())["summary"]
-    assert {*summary} == {*CASES} and summary["bare"]["entered"]["k"] == 2
-    assert summary["with the zone"]["changed_share"] == pytest.approx(0.1)
+    assert {*summary} == {*PLACES}
+    for of in summary.values():
+        assert {*of} == {*CASES} and of["bare"]["entered"]["k"] == 2
+        assert of["with it"]["changed_share"] == pytest.approx(0.1)

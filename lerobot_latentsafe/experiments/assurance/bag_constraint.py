@@ -1,10 +1,10 @@
-"""A new constraint without training, on the bag: the hand must not enter a zone, besides spilling nothing.
+"""A new constraint without training, on the bag: where the hand must not be, besides spilling nothing.
 
-Three recordings that enter the zone are labelled. An operator who swings the bag to the side then lifts it bare, under
-the filter as it was, and under the filter with the constraint, from the same starts.
+Three recordings that go there are labelled. An operator who wants to go there then acts bare, under the filter as it
+was, and under the filter with the constraint, from the same starts.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -24,29 +24,46 @@ from lerobot_latentsafe.franka.actions import STATE_NAMES
 from lerobot_latentsafe.franka.behaviors import begin
 from lerobot_latentsafe.modeling_latentsafe import LatentSafePolicy, load_filter
 
-NUMBER, LINE = "ee_x.pos", 0.56
-"""The zone is where the hand is farther from the arm's foot than this, m."""
-OPERATOR = "side_to_side_0.04"
 N_MARKED = 3
 FIRST_SEED = 340_000
 """Of the starts."""
-CASES = {"bare": None, "as it was": ["failure"], "with the zone": ["failure", "zone"], "the zone alone": ["zone"]}
+CASES = {"bare": None, "as it was": ["failure"], "with it": ["failure", "place"], "it alone": ["place"]}
 """The constraints that count; None: no filter."""
 
 
-def inside(state: np.ndarray) -> np.ndarray:
-    """Whether the hand is in the zone, of states (..., S): bool (...)."""
-    return state[..., STATE_NAMES.index(NUMBER)] > LINE
+@dataclass(frozen=True)
+class Place:
+    """Where the hand must not be.
+
+    Attributes:
+        between: number of the state -> least and largest there, m; of the gripper, opening.
+        operator: who wants to go there.
+    """
+
+    between: dict[str, tuple[float, float]]
+    operator: str
+
+    def holds(self, state: np.ndarray) -> np.ndarray:
+        """Whether the hand is there, of states (..., S): bool (...)."""
+        numbers = {name: state[..., STATE_NAMES.index(name)] for name in self.between}
+        return np.all([(low < numbers[name]) & (numbers[name] < high) for name, (low, high) in self.between.items()], 0)
 
 
-def mark(policy: LatentSafePolicy, root: Path) -> dict:
-    """The zone, of the first recordings that enter it and begin outside; all their frames are labelled."""
+PLACES = {
+    "zone": Place({"ee_x.pos": (0.56, np.inf)}, "side_to_side_0.04"),
+    "too high": Place({"ee_z.pos": (0.20, np.inf), "gripper.pos": (-np.inf, 0.5)}, "middle"),
+}
+"""The zone is far from the arm's foot; what the hand holds is lifted too high."""
+
+
+def mark(policy: LatentSafePolicy, root: Path, place: Place) -> list[dict]:
+    """The place, of the first recordings that go there and begin elsewhere; all their frames are labelled."""
     frames, columns = (
         DatasetFrames(load_metadata(f"latentsafe/{root.name}", root)),
         read_frames(root, ["observation.state"]),
     )
     own = {
-        episode: inside(columns["observation.state"][columns["episode_index"] == episode])
+        episode: place.holds(columns["observation.state"][columns["episode_index"] == episode])
         for episode in frames.episodes
     }
     marked = [episode for episode, fails in own.items() if not fails[0] and fails.sum() >= 4][:N_MARKED]
@@ -55,7 +72,7 @@ def mark(policy: LatentSafePolicy, root: Path) -> dict:
         where = policy.model.likeness(policy.model.world_model.features(latents)).numpy()
     places = np.concatenate([row[:n] for row, n in zip(where, lengths)])
     fails = np.concatenate([own[episode] for episode in marked])
-    return {"zone": policy.config.likeness.prototypes(places[fails], places[~fails], [NUMBER])}
+    return policy.config.likeness.prototypes(places[fails], places[~fails], [*place.between])
 
 
 @cache
@@ -65,51 +82,53 @@ def loaded(path: str) -> LatentSafePolicy:
 
 
 def run(job: dict) -> dict:
-    """One episode: whether the hand enters the zone, whether candies fall, success, and steps changed."""
+    """One episode: whether the hand goes there, whether candies fall, success, and steps changed."""
     torch.set_num_threads(1)
-    (behavior, speed), scene = OPERATORS[OPERATOR], bag_scene()
+    place, scene = PLACES[job["place"]], bag_scene()
+    behavior, speed = OPERATORS[place.operator]
     scene.reset(job["seed"])
     operator, policy = begin(behavior, scene, speed, np.random.default_rng([0, job["seed"]])), None
     if job["constraints"]:
         policy = loaded(job["filter"])
         likeness = policy.config.likeness
         policy.config.change(
-            likeness=replace(likeness, known={**likeness.own_failure, **job["zone"]}), constraints=job["constraints"]
+            likeness=replace(likeness, known={**likeness.own_failure, "place": job["prototypes"]}),
+            constraints=job["constraints"],
         )
     world = SceneWorld(scene, STEPS) if policy else SceneWorld(scene, STEPS, ())
     entered, changed = False, 0
     for step in steps(world, OperatorActor(operator, policy)):
-        entered |= bool(inside(scene.proprioception()))
+        entered |= bool(place.holds(scene.proprioception()))
         changed += 0 if step.decision is None else int(step.decision.intervened.sum())
     truth = scene.truth()
     return {"entered": entered, "lost": truth["spilled"], "success": bool(truth["is_success"]), "changed": changed}
 
 
 def study(path: str, recordings: Path, n: int, output: Path, workers: int = 1) -> None:
-    """Mark the zone, drive, and write the table; each episode is kept beside it as it ends.
+    """Mark each place, drive, and write the table; each episode is kept beside it as it ends.
 
     Args:
         path: a filter that takes constraints and says where the hand is.
-        recordings: a dataset of the bag with videos, in which the hand enters the zone now and then.
+        recordings: a dataset of the bag with videos, in which the hand goes to each place now and then.
         n: starts.
     """
     filter = loaded(path)
-    zone, law = mark(filter, recordings), filter.config.law.name
+    marked, law = {name: mark(filter, recordings, place) for name, place in PLACES.items()}, filter.config.law.name
+    cells = [(place, case) for place in PLACES for case in CASES]
     jobs = [
-        {"filter": path, "law": law, "zone": zone, "constraints": names, "seed": FIRST_SEED + i}
-        for names in CASES.values()
+        {"filter": path, "law": law, "place": place, "prototypes": marked[place], "constraints": CASES[case],
+         "seed": FIRST_SEED + i}
+        for place, case in cells
         for i in range(n)
-    ]
+    ]  # fmt: skip
     rows = run_resumable(output.with_suffix(".jsonl"), jobs, run, workers)
-    cells = dict(zip(CASES, np.array_split(np.array(rows, object), len(CASES))))
-    summary = {
-        name: {
+    summary: dict[str, dict[str, dict]] = {place: {} for place in PLACES}
+    for (place, case), of in zip(cells, np.array_split(np.array(rows, object), len(cells))):
+        summary[place][case] = {
             "entered": wilson(sum(row["entered"] for row in of), n),
             "spilled": wilson(sum(row["lost"] > 0 for row in of), n),
             "success": wilson(sum(row["success"] for row in of), n),
             "changed_share": float(np.mean([row["changed"] / STEPS for row in of])),
         }
-        for name, of in cells.items()
-    }
     minutes = sum(row["cpu_s"] for row in rows) / 60
-    write_json(output, {"summary": summary, "zone": zone, **provenance([FIRST_SEED, FIRST_SEED + n - 1], minutes)})
+    write_json(output, {"summary": summary, "marked": marked, **provenance([FIRST_SEED, FIRST_SEED + n - 1], minutes)})
