@@ -29,6 +29,8 @@ from lerobot_latentsafe.teleoperators.scripted.config_scripted import LatentSafe
 from lerobot_latentsafe.teleoperators.scripted.scripted import LatentSafeScripted
 
 EPISODES_A_PART = 50
+GIVEN_SECONDS = 15.0
+"""Length of an episode of a policy that is given: long enough to be stopped and to grasp anew, and for what falls late."""
 HIGH = 0.10
 """Height of the hand below which the fingers may hold something, m."""
 
@@ -167,7 +169,8 @@ def collect_franka(
     if policy is not None:
         require_policies(name)
         check_policy(policy, SCENES[source.scene].fps, SCENES[source.scene].image_size)
-        source, options = replace(source, mix={policy: n}), {**options, "policy": policy}
+        source = replace(source, mix={policy: n}, seconds=GIVEN_SECONDS)
+        options = {**options, "policy": policy}
     record = partial(_record, source, repo_id, seed)
     return record_in_parts(repo_id, root, options, n, record, EPISODES_A_PART, workers, tasks)
 
