@@ -32,6 +32,7 @@ from lerobot_latentsafe.modeling_latentsafe import load_filter
 from lerobot_latentsafe.safety_model import SafetyModel
 
 LOCAL_UPDATES = 8
+OF_A_DEMO = ("metrics.json", "states.npy", "random_cache", "margin")
 CLI = ("-m", "lerobot_latentsafe.cli")
 TWO = ("-m", "torch.distributed.run", "--standalone", "--local_addr=127.0.0.1", "--nproc_per_node=2")
 VARIANTS = {"one": (CLI, 1), "two": ((*TWO, *CLI), 1), "two, apart": ((*TWO, *CLI), LOCAL_UPDATES)}
@@ -116,6 +117,9 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=1000)
     parser.add_argument("--output", type=Path, default=Path("results/scale/local_updates.json"))
     given = parser.parse_args()
+    for demo in given.demos:
+        if missing := [name for name in OF_A_DEMO if not (demo / name).exists()]:
+            parser.error(f"--demos has {demo}, which lacks {', '.join(missing)}; expected folders of scripts/demo.py")
     began = os.times()
     rows: dict[str, list[float]] = {variant: [] for variant in (*VARIANTS, WORLD_MODEL)}
     for demo in given.demos:
