@@ -30,7 +30,7 @@ from lerobot_latentsafe.teleoperators.scripted.scripted import LatentSafeScripte
 
 EPISODES_A_PART = 50
 GIVEN_SECONDS = 15.0
-"""Length of an episode of a policy that is given: long enough to be stopped and to grasp anew, and for what falls late."""
+"""Length of an episode of a policy that is given: long enough to be stopped, to grasp anew, and for what falls late."""
 HIGH = 0.10
 """Height of the hand below which the fingers may hold something, m."""
 
