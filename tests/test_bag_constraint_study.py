@@ -27,7 +27,7 @@ def test_the_zone_is_far_from_the_foot():
 
 def test_only_what_is_held_can_be_too_high():
     hand = np.zeros((3, len(STATE_NAMES)))
-    hand[:, [STATE_NAMES.index("ee_z.pos"), STATE_NAMES.index("gripper.pos")]] = [0.25, 0.1], [0.25, 1.0], [0.15, 0.1]
+    hand[:, [STATE_NAMES.index("ee_z.pos"), STATE_NAMES.index("gripper.pos")]] = [0.25, 0.6], [0.25, 0.85], [0.15, 0.6]
     assert PLACES["too high"].holds(hand).tolist() == [True, False, False]
 
 

@@ -51,9 +51,9 @@ class Place:
 
 PLACES = {
     "zone": Place({"ee_x.pos": (0.56, np.inf)}, "side_to_side_0.04"),
-    "too high": Place({"ee_z.pos": (0.20, np.inf), "gripper.pos": (-np.inf, 0.5)}, "middle"),
+    "too high": Place({"ee_z.pos": (0.20, np.inf), "gripper.pos": (-np.inf, 0.7)}, "middle"),
 }
-"""The zone is far from the arm's foot; what the hand holds is lifted too high."""
+"""The zone is far from the arm's foot; what the hand holds, by at most .6 open fingers, is lifted too high."""
 
 
 def mark(policy: LatentSafePolicy, root: Path, place: Place) -> list[dict]:
