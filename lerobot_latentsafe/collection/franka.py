@@ -20,7 +20,7 @@ from lerobot_latentsafe.datasets.labels import FAILING, SAFE
 from lerobot_latentsafe.evaluation.rollouts import Choice, Step, steps
 from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES, action_limits, read_action
 from lerobot_latentsafe.franka.bag import BagScene, varied
-from lerobot_latentsafe.franka.behaviors import GRASPED, grasp, lower, stray
+from lerobot_latentsafe.franka.behaviors import GRASPED, grasp, stray
 from lerobot_latentsafe.franka.scenes import CLUMSINESS, HELD_ANYWHERE, SCENES
 from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
 from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
@@ -29,8 +29,6 @@ from lerobot_latentsafe.teleoperators.scripted.config_scripted import LatentSafe
 from lerobot_latentsafe.teleoperators.scripted.scripted import LatentSafeScripted
 
 EPISODES_A_PART = 50
-GIVEN_SECONDS = 15.0
-"""Length of an episode of a policy that is given: long enough to be stopped, to grasp anew, and for what falls late."""
 HIGH = 0.10
 """Height of the hand below which the fingers may hold something, m."""
 
@@ -115,15 +113,7 @@ SOURCES: dict[str, Source] = {
     "bag_middle": Source("bag", {"middle": 100}, astray=0.8),
     "bag_strong": Source("bag", {"middle": 240}, astray=0.8, pushed=0.1),
     "bag_weak": Source("bag", {"closed_end": 240}, variant="sealed", astray=0.8, pushed=0.1),
-    "bag_mixed": Source(
-        "bag",
-        {"nearer": 170, "regrasp": 90},
-        variant="sealed",
-        astray=0.8,
-        pushed=0.1,
-        seconds=8.0,
-        grasps=(0.6, 0.15, 0, 0.25, 0, 0, 0),
-    ),
+    "bag_mixed": Source("bag", {"nearer": 240}, variant="sealed", astray=0.8, pushed=0.1, seconds=8.0),
     "blocks_demos": Source("blocks", {"fetch": 200}),
     "blocks_random": Source("blocks", {"random": 200}),
 }
@@ -169,8 +159,7 @@ def collect_franka(
     if policy is not None:
         require_policies(name)
         check_policy(policy, SCENES[source.scene].fps, SCENES[source.scene].image_size)
-        source = replace(source, mix={policy: n}, seconds=GIVEN_SECONDS)
-        options = {**options, "policy": policy}
+        source, options = replace(source, mix={policy: n}), {**options, "policy": policy}
     record = partial(_record, source, repo_id, seed)
     return record_in_parts(repo_id, root, options, n, record, EPISODES_A_PART, workers, tasks)
 
@@ -251,11 +240,9 @@ def _begin(robot: LatentSafeFrankaMujoco, source: Source, episode: int, scene_se
     if source.branches:
         n_frames -= _grasp(robot, scene_seed, source)
     rng = np.random.default_rng([8, scene_seed])
-    if source.behavior(episode) == "regrasp":
-        _grasp(robot, scene_seed, source)
-        _go(robot, lower(scene, rng))
-    elif rng.random() < source.astray:
-        _go(robot, stray(scene, GRASPED[source.behavior(episode)], rng))
+    if rng.random() < source.astray:
+        bag: BagScene = scene
+        _go(robot, stray(bag, GRASPED[source.behavior(episode)], rng))
     return _pushes(source.pushed / info.fps, n_frames, rng)
 
 
