@@ -305,6 +305,12 @@ lerobot-rollout --policy.path=x --policy.law.mode=monitor --robot.type=latentsaf
     assert problems(ROOT / "README.md", text) == []
 
 
+@pytest.mark.parametrize("script", sorted(path.name for path in (ROOT / "scripts").glob("*.py")))
+def test_a_script_reads_its_command_line(script):
+    """Of one that does not, --help does the work."""
+    assert ".parse_args(" in (ROOT / "scripts" / script).read_text()
+
+
 def test_readme_is_short():
     text = (ROOT / "README.md").read_text()
     assert len(text.splitlines()) <= 200 and len(text.split()) <= 1300
