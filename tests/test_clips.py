@@ -9,6 +9,7 @@ import torch
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from lerobot_latentsafe.constraint_training import numbered
 from lerobot_latentsafe.datasets.build_cache import build_frame_cache
 from lerobot_latentsafe.datasets.labels import UnlabelledDatasetError
 from lerobot_latentsafe.modeling_latentsafe import adopt
@@ -178,6 +179,12 @@ def test_a_failure_between_two_frames_counts(counting_root, tmp_path):
     reader.labels = replace(reader.labels, failure=failing)
     clip = reader.cut(np.array([0, 1, 3, 5]))
     assert clip.failure.tolist() == [[0, 0, 1], [0, 1, 0], [0, 1, 0], [0, 0, 0]]
+
+
+def test_numbers_in_place_of_labels_stay_those_of_their_frames(counting_root, tmp_path):
+    build_frame_cache(LeRobotDataset("me/counting", root=counting_root), tmp_path / "cache", 8)
+    reader = numbered(reading(tmp_path / "cache", frame_skip=3, clip_length=3).policy.reader)
+    assert reader.cut(np.array([0, 1])).failure.tolist() == [[0, 3, 6], [1, 4, 7]]
 
 
 def test_actions_and_states_are_scaled_by_the_datasets_range(clip_at):

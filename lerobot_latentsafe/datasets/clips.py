@@ -302,5 +302,5 @@ class ClipReader:
         """Labels of frames (B, T): 1 also where it was 1 since the frame before."""
         found = label[window]
         between = (label[since[:, 1:, 1:]] == 1).any(-1)  # the frame before and the window's first count by themselves
-        found[:, 1:] = np.where(between, 1, found[:, 1:])
+        found[:, 1:] = np.maximum(found[:, 1:], between)
         return torch.from_numpy(found).long()
