@@ -1,7 +1,7 @@
 #!/usr/bin/env python
 """What the hand must not do, added to the bag's filter without training: enter a zone, lift the bag too high.
 
-    latentsafe train-reachability --policy.path=bag --dataset.repo_id=latentsafe/bag_cache \\
+    latentsafe train-reachability --policy.path=outputs/bag/margin_dino_wm_0 --dataset.repo_id=latentsafe/bag_cache \\
       --dataset.root=data/bag_tokens \\
       --output_dir=outputs/bag_alike --alike='{ee_x.pos: 0.05, ee_y.pos: 0.05, ee_z.pos: 0.05, gripper.pos: 0.4}'
     scripts/bag_constraint.py --filter=outputs/bag_alike --recordings=data/bag_pulls

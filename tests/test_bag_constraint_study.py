@@ -12,7 +12,7 @@ from lerobot_latentsafe.experiments.assurance import bag_constraint as study_mod
 from lerobot_latentsafe.experiments.assurance.bag_constraint import CASES, PLACES, mark, run, study
 from lerobot_latentsafe.franka.actions import STATE_NAMES
 
-(NUMBER,), ((LINE, _),) = PLACES["zone"].between.keys(), PLACES["zone"].between.values()
+((NUMBER, (LINE, _)),) = PLACES["zone"].between.items()
 
 
 def states(x):
