@@ -221,8 +221,9 @@ class LatentReachability:
                 row["end_x"] = torch.where(over[:, None], x, later["end_x"])
                 row["end_over"] = over | later["end_over"]
             later = row
-        for row in rows if as_recorded is not None else []:
-            row["worst"] = torch.where(as_recorded, -1.0, row["worst"])
+        if as_recorded is not None:
+            for row in rows:
+                row["worst"] = torch.where(as_recorded, -1.0, row["worst"])
 
     def _random_actions(self) -> Tensor:
         """(n, A): the index of a candidate in the first column, or an action if they are continuous."""

@@ -33,6 +33,7 @@ from lerobot_latentsafe.safety_model import SafetyModel
 
 LOCAL_UPDATES = 8
 OF_A_DEMO = ("metrics.json", "states.npy", "random_cache", "margin")
+"""What is read of a folder of scripts/demo.py."""
 CLI = ("-m", "lerobot_latentsafe.cli")
 TWO = ("-m", "torch.distributed.run", "--standalone", "--local_addr=127.0.0.1", "--nproc_per_node=2")
 VARIANTS = {"one": (CLI, 1), "two": ((*TWO, *CLI), 1), "two, apart": ((*TWO, *CLI), LOCAL_UPDATES)}
