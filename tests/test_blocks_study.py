@@ -13,6 +13,7 @@ import torch
 from lerobot_latentsafe.experiments.blocks import study, table2
 from lerobot_latentsafe.experiments.blocks.simulator_lookahead import SimulatorLookahead
 from lerobot_latentsafe.experiments.blocks.study import lead
+from lerobot_latentsafe.experiments.blocks.warning import warnings_of, watch
 from lerobot_latentsafe.franka.behaviors import CLOSED, begin, reach, up
 from lerobot_latentsafe.franka.scenes import make_scene
 
@@ -152,3 +153,22 @@ def test_the_table_is_written_and_goes_on_where_it_stopped(trained, tiny_dreamer
     made = cells.read_text()
     script.main()
     assert made == cells.read_text()
+
+
+def test_warnings_are_counted_where_it_fails_and_where_nothing_does():
+    row = lambda failed, *value: {"violation": failed, "margin": [1, 1, 1, -failed], "value": value}  # noqa: E731
+    rows = [row(True, 1, 0.3, -1, -1), row(True, 0.3, -1, -1, -1), row(False, 1, 1, 1, 1), row(False, 1, 0.1, 1, 1)]
+    found = warnings_of(rows, "value", 0.3)
+    assert (found["n"], found["median"], found["share_of_3_or_more"]) == (2, 2.5, 0.5)
+    assert (found["false_alarms"]["k"], found["false_alarms"]["n"]) == (1, 2)
+    assert "median" not in warnings_of(rows[2:], "value", 0.3)
+
+
+def test_a_filter_that_looks_on_says_how_early_it_warns(trained, tiny_dreamer, tmp_path):
+    watch(str(tiny_dreamer / "policy"), str(trained / "reachability"), 2, tmp_path / "warning.json")
+    table = json.loads((tmp_path / "warning.json").read_text())
+    rows = [json.loads(line)["row"] for line in (tmp_path / "warning.jsonl").read_text().splitlines()]
+    for column in ("value", "foreseen"):
+        assert list(table[column]["warnings"]) == ["0", "0.2", "0.4", "0.6"]
+        assert all(len(row[column]) == len(row["margin"]) == row["steps"] for row in rows)
+    assert all(row["value"] != row["foreseen"] for row in rows)

@@ -72,8 +72,8 @@ def run(job: dict) -> dict:
 
     Returns:
         success, the block was picked up and no red one fell (the paper's); violation; held, it is up at the end;
-        leaning, the episode ended with a red block that has not fallen yet, but will; steps; overridden; of a violation
-        that was looked on at, also margin and value, l and V of each step.
+        leaning, the episode ended with a red block that has not fallen yet, but will; steps; overridden; of what was
+        looked on at, also margin and value, l and V of each step, and foreseen, V of its proposal, which the law reads.
     """
     return run_filmed(job)[0]
 
@@ -85,12 +85,13 @@ def run_filmed(job: dict) -> tuple[dict, list[np.ndarray]]:
     torch.manual_seed(job["seed"])
     world = EnvironmentsWorld([env], [job["seed"]])
     actor, bound = PolicyActor(policy), LookaheadActor(policy, env.scene) if job["mode"] == "lookahead" else None
-    frames, latents, overridden, lifted = [], [], 0, False
+    frames, latents, foreseen, overridden, lifted = [], [], [], 0, False
     for step in steps(world, bound or actor):
         frames.append(picture(step.seen[FRONT]))
         if step.decision is not None:
             overridden += bool(step.decision.intervened)
             latents.append(actor.latent)
+            foreseen.append(step.decision.value.item())
         lifted |= step.info[0]["lifted"]
     (info,) = world.info
     failed = info["failure"]
@@ -99,8 +100,9 @@ def run_filmed(job: dict) -> tuple[dict, list[np.ndarray]]:
         "leaning": bool(info["tilt"] > POINT_OF_NO_RETURN) and not failed, "steps": env.steps,
         "overridden": bound.overridden if bound else overridden,
     }  # fmt: skip
-    if job["mode"] == "monitor" and failed and isinstance(policy, LatentSafePolicy):
+    if job["mode"] == "monitor" and isinstance(policy, LatentSafePolicy):
         row |= {name: column.tolist() for name, column in zip(("margin", "value"), values_of(policy.model, latents))}
+        row |= {"foreseen": foreseen}
     return row, frames
 
 
