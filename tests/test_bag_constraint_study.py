@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_latentsafe.constraints import LikenessConfig
+from lerobot_latentsafe.constraints import ConstraintError, LikenessConfig
 from lerobot_latentsafe.experiments.assurance import bag_constraint as study_module
 from lerobot_latentsafe.experiments.assurance.bag_constraint import CASES, PLACES, mark, run, study
 from lerobot_latentsafe.franka.actions import STATE_NAMES
 
+ALIKE = {number: 0.05 for place in PLACES.values() for number in place.between}
 ((NUMBER, (LINE, _)),) = PLACES["zone"].between.items()
 
 
@@ -55,6 +56,23 @@ def test_what_is_marked_lies_in_the_zone(monkeypatch, tmp_path):
     assert where - reach == pytest.approx(LINE, abs=0.02) and where + reach > 0.61
 
 
+@pytest.mark.parametrize("alike", [{}, {"x.pos": 0.25}])
+def test_a_filter_that_does_not_say_where_the_hand_is_is_refused(alike, monkeypatch, tmp_path):
+    loaded = SimpleNamespace(config=SimpleNamespace(likeness=LikenessConfig(alike)))
+    monkeypatch.setattr(study_module, "loaded", lambda path: loaded)
+    with pytest.raises(ConstraintError, match=r"--filter mine says nothing of .*ee_z\.pos.* --alike"):
+        study("mine", tmp_path, 1, tmp_path / "table.json")
+
+
+def test_recordings_that_never_go_there_are_refused(monkeypatch, tmp_path):
+    columns = {"observation.state": states(np.full(20, LINE - 0.1)), "episode_index": np.zeros(20, int)}
+    monkeypatch.setattr(study_module, "load_metadata", lambda name, root: None)
+    monkeypatch.setattr(study_module, "DatasetFrames", lambda meta: SimpleNamespace(episodes=[0]))
+    monkeypatch.setattr(study_module, "read_frames", lambda root, names: columns)
+    with pytest.raises(ConstraintError, match=r"no episode of .* begins elsewhere and goes where"):
+        mark(SimpleNamespace(), tmp_path, PLACES["zone"])
+
+
 @pytest.mark.parametrize("place", PLACES)
 def test_a_bare_run_tells_what_became_of_it(place, monkeypatch):
     monkeypatch.setattr(study_module, "STEPS", 2)
@@ -63,7 +81,9 @@ def test_a_bare_run_tells_what_became_of_it(place, monkeypatch):
 
 
 def test_the_table_has_all_cases(monkeypatch, tmp_path):
-    loaded = SimpleNamespace(config=SimpleNamespace(law=SimpleNamespace(name="reachability")))
+    loaded = SimpleNamespace(
+        config=SimpleNamespace(law=SimpleNamespace(name="reachability"), likeness=LikenessConfig(ALIKE))
+    )
     monkeypatch.setattr(study_module, "loaded", lambda path: loaded)
     monkeypatch.setattr(study_module, "mark", lambda policy, root, place: [])
     row = {"entered": True, "lost": 1, "success": False, "changed": 9}

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from lerobot_latentsafe.constraints import ConstraintError
 from lerobot_latentsafe.datasets.episodes import DatasetFrames
 from lerobot_latentsafe.datasets.folder import load_metadata
 from lerobot_latentsafe.datasets.labels import read_frames
@@ -67,6 +68,11 @@ def mark(policy: LatentSafePolicy, root: Path, place: Place) -> list[dict]:
         for episode in frames.episodes
     }
     marked = [episode for episode, fails in own.items() if not fails[0] and fails.sum() >= 4][:N_MARKED]
+    if not marked:
+        raise ConstraintError(
+            f"no episode of {root} begins elsewhere and goes where {place.between} holds for 4 frames; expected such "
+            "recordings as `latentsafe collect --source=bag_pulls` makes"
+        )
     with torch.no_grad():
         latents, lengths = encode_episodes(policy.model, frames, marked)
         where = policy.model.likeness(policy.model.world_model.features(latents)).numpy()
@@ -111,8 +117,18 @@ def study(path: str, recordings: Path, n: int, output: Path, workers: int = 1) -
         path: a filter that takes constraints and says where the hand is.
         recordings: a dataset of the bag with videos, in which the hand goes to each place now and then.
         n: starts.
+
+    Raises:
+        ConstraintError: the filter does not say where the hand is, or no recording goes to a place.
     """
     filter = loaded(path)
+    asked = {number for place in PLACES.values() for number in place.between}
+    unknown = sorted(asked - {*filter.config.likeness.alike})
+    if unknown:
+        raise ConstraintError(
+            f"--filter {path} says nothing of {', '.join(unknown)}; expected a critic that was trained with --alike of "
+            "these: see --help"
+        )
     marked, law = {name: mark(filter, recordings, place) for name, place in PLACES.items()}, filter.config.law.name
     cells = [(place, case) for place in PLACES for case in CASES]
     jobs = [
