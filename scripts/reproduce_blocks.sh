@@ -10,14 +10,14 @@ BIN=.venv/bin CORES=${CORES:-2}
 export HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1
 mkdir -p "$OUT"
 
-training= critic= results=results/blocks n=
+training= critic= results=results/blocks n= early=
 if [ "$quick" ]; then
   training="--demonstrations=40 --pretraining=300 --steps=600 --n_envs=8 --batch_size=12 --save_every=200"
   critic="--steps=600"
-  results="$OUT/results" n="--n=12 --n_curve=4"
+  results="$OUT/results" n="--n=12 --n_curve=4" early="--n=12"
 fi
 
-# $training, $critic and $n are lists of options.
+# $training, $critic, $n and $early are lists of options.
 # shellcheck disable=SC2086
 {
   [ -e "$OUT/dreamer/episodes" ] || OMP_NUM_THREADS=$CORES \
@@ -36,5 +36,7 @@ fi
 
   $BIN/python scripts/blocks_table2.py --dreamer "$OUT/dreamer/policy" --filters "$OUT"/reachability/final_{0,1,2} \
     --risks "$OUT"/risk/final_{0,1,2} --cells "$OUT/cells.jsonl" --output_dir="$results" --workers="$CORES" $n
+  $BIN/python scripts/blocks_warning.py --filter="$OUT/reachability/final_0" --dreamer="$OUT/dreamer/policy" \
+    --output="$results/warning.json" --workers="$CORES" $early
   cp "$OUT/dreamer/log.jsonl" "$results/train_dreamer.jsonl"
 }
