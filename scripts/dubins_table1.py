@@ -3,9 +3,9 @@
 
     scripts/dubins_table1.py --filters outputs/dubins/filter_0 outputs/dubins/filter_1 --seeds 0 1 2
 
-Rows: the latent filters as they are used, their critics alone (lookahead 0), the privileged baseline (trained here, one
-critic a seed), and three that keep them honest: a planner that only imagines held actions with the same world models,
-the failure classifier alone, always safe.
+Rows: the latent filters as they are used, the same with 25 steps of imagination, their critics alone (lookahead 0), the
+privileged baseline (trained here, one critic a seed), and three that keep them honest: a planner that only imagines
+held actions with the same world models, the failure classifier alone, always safe.
 """
 
 import argparse

@@ -27,6 +27,8 @@ from lerobot_latentsafe.latent import Latent
 from lerobot_latentsafe.modeling_latentsafe import load_filter
 from lerobot_latentsafe.reports.figures import save
 
+LOOKAHEADS = {"latent": None, "latent_25_ahead": 25, "critic_alone": 0}
+"""Row -> `law.lookahead`; None: the filter's own."""
 Truths = dict[str, np.ndarray]
 """discrete and continuous -> the exact V of each state (N,)."""
 
@@ -68,16 +70,14 @@ def latent_rows(path: str, states: np.ndarray, truths: Truths) -> tuple[dict[str
     def judged(safe: Callable[[Latent], Tensor]) -> dict:
         return score(torch.cat([safe(latent) for latent in seen]).numpy(), truths)
 
-    policy.config.change(law=replace(law, lookahead=0))
-    critic = {**judged(monitor.safe), **rollouts(monitor)}
+    rows = {}
+    for name, ahead in LOOKAHEADS.items():
+        policy.config.change(law=replace(law, lookahead=law.lookahead if ahead is None else ahead))
+        rows[name] = {**judged(monitor.safe), **rollouts(monitor)}
     policy.config.change(law=law)
     plan = PlanMonitor(monitor).value(states[::5]) > 0  # every fifth state will do for a control
-    rows = {
-        "latent": {**judged(monitor.safe), **rollouts(monitor)},
-        "critic_alone": critic,
-        "plan": score(plan, {name: true[::5] for name, true in truths.items()}),
-        "failure_classifier_alone": judged(lambda latent: policy.model.imagination.margin(latent) > 0),
-    }
+    rows["plan"] = score(plan, {name: true[::5] for name, true in truths.items()})
+    rows["failure_classifier_alone"] = judged(lambda latent: policy.model.imagination.margin(latent) > 0)
     return rows, monitor
 
 
@@ -104,7 +104,7 @@ def write_table(filters: list[str], seeds: list[int], folder: Path) -> None:
         rows, latent = latent_rows(path, states, truths)
         for name, row in rows.items():
             found.setdefault(name, []).append(row)
-        for name in ("latent", "critic_alone", "plan"):
+        for name in (*LOOKAHEADS, "plan"):
             _tell(f"{path} {name}", rows[name])
     cpu = []
     for seed in seeds:
@@ -113,9 +113,9 @@ def write_table(filters: list[str], seeds: list[int], folder: Path) -> None:
         cpu.append(minutes)
         _tell(f"privileged {seed}", row)
 
-    table = {name: {"seeds": found[name], "summary": summary(found[name])} for name in (
-        "latent", "critic_alone", "privileged",
-    )}  # fmt: skip
+    table: dict[str, dict] = {
+        name: {"seeds": found[name], "summary": summary(found[name])} for name in (*LOOKAHEADS, "privileged")
+    }
     table |= {name: {"seeds": found[name]} for name in ("plan", "failure_classifier_alone")}
     table["always_safe"] = {"seeds": [score(np.ones(len(states), bool), truths)]}
     header = {"figures": "each row against both truths; safe_policy and boundary are shares of runs that stay safe"}
