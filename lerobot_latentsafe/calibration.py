@@ -24,7 +24,7 @@ ALL = "all episodes"
 """The group of all episodes."""
 DECIDING = (
     "name", "epsilon", "resume_above", "proposal_steps", "lookahead", "samples", "history_frames", "retreat",
-    "retreat_after", "min_retreat_steps",
+    "retreat_after", "min_retreat_steps", "max_retreat_steps",
 )  # fmt: skip
 """What of a law changes V or the decision; the rest says what is in time, and whether it acts."""
 OF_NEAREST = ("kappa", "replan_above")

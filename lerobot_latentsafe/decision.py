@@ -74,6 +74,8 @@ class LawOptions:
     """Overrides in the last ten steps after which the next override is the retreat's."""
     min_retreat_steps: int | None = None
     """Steps for which a retreat goes on at least."""
+    max_retreat_steps: int | None = None
+    """Steps for which a retreat goes on at most, before the critic's action has its turn; 0: till something passes."""
     kappa: float | None = None
     """Law nearest: V of what is executed is at most so far below V of the safest candidate."""
     replan_above: float | None = None
@@ -117,6 +119,8 @@ class LawConfig:
             same for waiting at a doubtful place as for leaving it, so the critic may wait.
         retreat_after: overrides in the last ten steps after which the next override is the retreat's.
         min_retreat_steps: steps for which a retreat goes on at least: a single step leads nowhere.
+        max_retreat_steps: steps after which a retreat has failed, such as that of a hand that stands on the table; then
+            the critic's action has its turn until an action passes. 0: it goes on as long as nothing passes.
         kappa: of the law `nearest`: among candidates that pass, those whose V is more than this below the safest one's
             are not taken. 0 takes the safest; 2, the width of all values, asks no more than to pass.
         replan_above: of the law `nearest`: a change of the proposal by more than this makes the base policy plan anew,
@@ -143,6 +147,7 @@ class LawConfig:
     retreat: dict[str, float] = field(default_factory=dict)
     retreat_after: int = 0
     min_retreat_steps: int = 1
+    max_retreat_steps: int = 0
     kappa: float = 0.2
     replan_above: float = 0.25
     deadline_ms: float | None = None
@@ -161,6 +166,10 @@ class LawConfig:
             "proposal_steps": (1 <= self.proposal_steps <= 25, "1 (the paper's law) to 25 steps"),
             "retreat_after": (0 <= self.retreat_after <= RECENT, f"0 (retreat at once) to {RECENT} overrides"),
             "min_retreat_steps": (self.min_retreat_steps >= 1, "at least 1 step"),
+            "max_retreat_steps": (
+                self.max_retreat_steps == 0 or self.max_retreat_steps >= self.min_retreat_steps,
+                f"0 (no end), or at least the {self.min_retreat_steps} of min_retreat_steps",
+            ),
             "kappa": (0 <= self.kappa <= 2, "0 (the safest candidate) to 2 (any that passes)"),
             "replan_above": (0 <= self.replan_above < math.inf, "a distance in standardised units, 0 or more"),
             "history_frames": (self.history_frames == 0 or self.history_frames >= 2, "0 (all) or at least 2 frames"),
@@ -314,12 +323,13 @@ class Overrides:
     Attributes:
         recent: bool (B, RECENT), whether the fallback acted, the latest last.
         retreated: int64 (B,), steps of a retreat that goes on.
+        failed: bool (B,), whether a retreat went on for as long as it may, and nothing has passed since.
         adjusted: bool (B, RECENT), whether the nearest action that passes was taken, the latest last.
     """
 
     def __init__(self, n: int):
         self.recent, self.retreated = np.zeros((n, RECENT), bool), np.zeros(n, np.int64)
-        self.adjusted = np.zeros((n, RECENT), bool)
+        self.adjusted, self.failed = np.zeros((n, RECENT), bool), np.zeros(n, bool)
 
     def threshold(self, law: LawConfig) -> np.ndarray:
         """What V must exceed (B,): epsilon, and `resume_above` where the fallback acts. Infinite for the first
@@ -330,19 +340,21 @@ class Overrides:
     def retreats(self, law: LawConfig) -> np.ndarray:
         """Whether an override now would be the retreat's: one goes on, or the critic's action has been tried: (B,)."""
         tried = self.recent.sum(1) >= law.retreat_after
-        return (self.retreated > 0) | tried if law.retreat else np.zeros_like(tried)
+        return ((self.retreated > 0) | tried) & ~self.failed if law.retreat else np.zeros_like(tried)
 
     def may_adjust(self, law: LawConfig) -> np.ndarray:
         """Whether the nearest action that passes may be taken, or it was often enough that the retreat is due: (B,)."""
         return ~((self.adjusted.sum(1) >= ADJUSTED_AT_MOST) & bool(law.retreat))
 
-    def after(self, acts: np.ndarray, retreats: np.ndarray, adjusted: np.ndarray) -> "Overrides":
+    def after(self, law: LawConfig, acts: np.ndarray, retreats: np.ndarray, adjusted: np.ndarray) -> "Overrides":
         """One step on: whether the fallback acted, whether that was the retreat's, and whether the nearest action that
         passes was taken, bool (B,) each."""
         new = Overrides(len(acts))
         new.recent[:, :-1], new.recent[:, -1] = self.recent[:, 1:], acts
         new.adjusted[:, :-1], new.adjusted[:, -1] = self.adjusted[:, 1:], adjusted
         new.retreated = (self.retreated + 1) * (acts & retreats)
+        at_its_end = (new.retreated >= law.max_retreat_steps) & (law.max_retreat_steps > 0)
+        new.failed = acts & (self.failed | at_its_end)
         return new
 
 

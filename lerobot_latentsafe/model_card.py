@@ -254,7 +254,8 @@ def _last_resort(law: LawConfig) -> str:
         return "the critic's action"
     moves = ", ".join(f"{name} {motion:+g} a step" for name, motion in law.retreat.items())
     tried = f"the critic's action; after {law.retreat_after} overrides within {RECENT} steps "
-    return f"{tried if law.retreat_after else ''}the retreat ({moves}) for at least {law.min_retreat_steps} steps"
+    most = f" and at most {law.max_retreat_steps}" if law.max_retreat_steps else ""
+    return f"{tried if law.retreat_after else ''}the retreat ({moves}) for at least {law.min_retreat_steps}{most} steps"
 
 
 def _world_model(config: LatentSafeConfig) -> str:

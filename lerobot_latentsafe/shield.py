@@ -418,7 +418,8 @@ class Shield:
 
     def _remember(self, judgement: Judgement, decision: FilterDecision, observation: dict[str, Any]) -> None:
         adjusted = decision.adjusted.numpy()
-        self.overrides = self.overrides.after(decision.falls_back.numpy(), judgement.retreats, adjusted)
+        acts, law = decision.falls_back.numpy(), self.model.config.law
+        self.overrides = self.overrides.after(law, acts, judgement.retreats, adjusted)
         self._accepted = np.where(adjusted, judgement.nearest.candidate, -1)
         self.beliefs.append(judgement.belief)  # in place of the one that it grew out of
         self.foretold.append(judgement.foretold)

@@ -135,6 +135,8 @@ def test_card_says_what_acts_in_place_of_an_unsafe_action(policy):
     assert said() == "the critic's action"
     policy.config.law.retreat, policy.config.law.min_retreat_steps = {"turn_rate.vel": -0.5}, 15
     assert said() == "the retreat (turn_rate.vel -0.5 a step) for at least 15 steps"
+    policy.config.law.max_retreat_steps = 40
+    assert said().endswith("for at least 15 and at most 40 steps")
     policy.config.law.retreat_after = 2
     assert said().startswith("the critic's action; after 2 overrides within 10 steps the retreat (turn_rate.vel")
 

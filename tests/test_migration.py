@@ -125,7 +125,9 @@ def test_a_robot_behind_an_old_filter_is_refused(verb, tmp_path):
         main([verb, f"--filter={old}", *robot, *(dataset if verb == "record" else [])])
 
 
-SINCE_0_3_OF_THE_LAW = [("law", name) for name in ("slack_ms", "unknown", "kappa", "replan_above", "engine")]
+SINCE_0_3_OF_THE_LAW = [
+    ("law", name) for name in ("slack_ms", "unknown", "kappa", "replan_above", "engine", "max_retreat_steps")
+]
 SINCE_0_3_OF_TRAINING = [
     ("margin", "noise"), ("margin", "gradient_penalty"), ("reachability", "hinge"), ("reachability", "local_updates"),
     ("reachability", "recorded"),

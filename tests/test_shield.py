@@ -345,6 +345,21 @@ def test_after_some_overrides_the_retreat_acts_and_goes_on(restless):
     assert retreats(shield(along(1)[0], one)) == [False] * 3
 
 
+def test_a_retreat_that_does_not_help_makes_way_for_the_critic(restless):
+    config, shield = restless.config, restless.shield
+    config.law.retreat, config.law.min_retreat_steps, config.law.max_retreat_steps = RETREAT, 2, 3
+    one = actions(OUTSIDE, LEFT, LEFT)
+    for seen, (proposed, retreat) in zip(along(9), (
+        *[(one, True)] * 3,  # it acts for as long as it may,
+        *[(one, False)] * 3,  # then the critic's action has its turn,
+        (actions(LEFT), False),  # until an action passes
+        *[(one, True)] * 2,
+    )):  # fmt: skip
+        decision = shield(seen, proposed)
+        assert decision.intervened.tolist() == [proposed is one, False, False]
+        assert retreats(decision) == [retreat, False, False]
+
+
 def test_overrides_of_long_ago_do_not_count(restless):
     restless.config.law.retreat, restless.config.law.retreat_after = RETREAT, 1
     for pause, retreat in ((8, True), (10, False)):
@@ -415,6 +430,7 @@ def test_what_was_executed_instead_is_remembered(policy):
         ("resume_above", 1.0, "less than 1"),
         ("resume_above", math.nan, "less than 1"),
         ("min_retreat_steps", 0, "at least 1 step"),
+        ("max_retreat_steps", -1, "0 .no end., or at least the 1 of min_retreat_steps"),
         ("retreat_after", 11, "10 overrides"),
         ("history_frames", 1, "at least 2 frames"),
         ("history_frames", -4, "at least 2 frames"),

@@ -66,6 +66,7 @@ def in_use(settings: list[FilterSetting]) -> dict[str, dict]:
         row |= {"memory": own.history_frames} if own.history_frames else {}
         if own.retreat:
             row |= {"retreat": own.retreat, "patience": own.retreat_after, "dwell": own.min_retreat_steps}
+            row |= {"most": own.max_retreat_steps} if own.max_retreat_steps else {}
     return rows
 
 
