@@ -7,6 +7,9 @@ Encodes the demonstrations, learns to foresee in them where the fingers will clo
 lerobot_latentsafe/policies/grasp_training.py), trains a policy by configs/bag_diffusion.yaml on that, and writes one
 that sees it by itself. What is done is skipped, and a killed training goes on from its last checkpoint.
 
+Where the demonstrations say where the bag is (bag_mixed does, as observation.environment_state), the policy is told
+that wherever it runs, instead of looking.
+
 It takes the steps of lerobot-train: the same configuration, policy, processors, optimiser and checkpoints. Only the
 windows come from memory: for a policy as small as this, LeRobot's loader takes most of the time.
 """

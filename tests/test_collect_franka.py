@@ -17,7 +17,7 @@ from lerobot_latentsafe.collection.policy_operator import check_policy
 from lerobot_latentsafe.collection.quiet import quiet_recording
 from lerobot_latentsafe.datasets.labels import FailureLabels
 from lerobot_latentsafe.franka.actions import action_limits
-from lerobot_latentsafe.franka.bag import VARIANTS, Variant
+from lerobot_latentsafe.franka.bag import MIDDLE, TAIL, VARIANTS, Variant
 from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
 from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
 from lerobot_latentsafe.runtime.locations import CheckpointError
@@ -105,6 +105,15 @@ def test_branches_share_their_grasp_and_differ_after_it():
     np.testing.assert_array_equal(state(0, 0), state(1, 0))
     assert np.abs(state(0, 3) - state(1, 3)).max() > 0
     assert np.abs(state(0, 0) - state(5, 0)).max() > 0.01
+
+
+def test_a_bag_that_is_being_lowered_is_put_down_and_lifted_by_its_middle():
+    source = replace(SOURCES["bag_mixed"], mix={"regrasp": 1}, grasps=(1, 0, 0, 0, 0, 0, 0))
+    with LatentSafeFrankaMujoco(LatentSafeFrankaMujocoConfig(image_size=32, variant="sealed")) as robot:
+        truths = list(franka.episode_truths(robot, source, 0, 0))
+    grasps = [truth["grasp"] for truth in truths if truth["grasp"] >= 0]
+    assert grasps[0] == TAIL and grasps[-1] == MIDDLE and -1 in [truth["grasp"] for truth in truths]
+    assert not truths[0]["lifted"] and truths[-1]["is_success"]
 
 
 @pytest.mark.parametrize("source", [name for name, source in SOURCES.items() if source.varied])

@@ -15,12 +15,12 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_latentsafe.collection.interventions import BRIEF, RARE, RETREATING, Interventions, InterventionStyle
 from lerobot_latentsafe.collection.parts import record_in_parts
-from lerobot_latentsafe.collection.policy_operator import PolicyOperator, check_policy
+from lerobot_latentsafe.collection.policy_operator import LOCATION, PolicyOperator, check_policy
 from lerobot_latentsafe.datasets.labels import FAILING, SAFE
 from lerobot_latentsafe.evaluation.rollouts import Choice, Step, steps
 from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES, action_limits, read_action
 from lerobot_latentsafe.franka.bag import BagScene, varied
-from lerobot_latentsafe.franka.behaviors import GRASPED, grasp, stray
+from lerobot_latentsafe.franka.behaviors import GRASPED, grasp, lower, stray
 from lerobot_latentsafe.franka.scenes import CLUMSINESS, HELD_ANYWHERE, SCENES
 from lerobot_latentsafe.robots.franka_mujoco.config_franka_mujoco import LatentSafeFrankaMujocoConfig
 from lerobot_latentsafe.robots.franka_mujoco.franka_mujoco import LatentSafeFrankaMujoco
@@ -54,6 +54,7 @@ class Source:
         style: how somebody intervenes in what policies and operators do, if at all.
         shield: name of the filter that says when, instead of chance.
         seconds: how long an episode lasts; None: as long as the scene's.
+        told: where the bag is, is recorded, too: for policies that are told instead of looking.
     """
 
     scene: str
@@ -70,6 +71,7 @@ class Source:
     style: InterventionStyle | None = None
     shield: str | None = None
     seconds: float | None = None
+    told: bool = False
 
     @property
     def n_episodes(self) -> int:
@@ -113,7 +115,16 @@ SOURCES: dict[str, Source] = {
     "bag_middle": Source("bag", {"middle": 100}, astray=0.8),
     "bag_strong": Source("bag", {"middle": 240}, astray=0.8, pushed=0.1),
     "bag_weak": Source("bag", {"closed_end": 240}, variant="sealed", astray=0.8, pushed=0.1),
-    "bag_mixed": Source("bag", {"nearer": 240}, variant="sealed", astray=0.8, pushed=0.1, seconds=8.0),
+    "bag_mixed": Source(
+        "bag",
+        {"nearer": 160, "regrasp": 100},
+        variant="sealed",
+        astray=0.8,
+        pushed=0.1,
+        seconds=8.0,
+        grasps=(0.6, 0.15, 0, 0.25, 0, 0, 0),
+        told=True,
+    ),
     "blocks_demos": Source("blocks", {"fetch": 200}),
     "blocks_random": Source("blocks", {"random": 200}),
 }
@@ -128,6 +139,7 @@ def features(source: Source) -> dict:
         "observation.images.front": image,
         "observation.images.wrist": dict(image),
         "observation.state": {"dtype": "float32", "shape": (len(STATE_NAMES),), "names": STATE_NAMES},
+        **(LOCATION if source.told else {}),
         "action": {"dtype": "float32", "shape": (len(ACTION_NAMES),), "names": ACTION_NAMES},
         "failure": {"dtype": "int64", "shape": (1,), "names": None},
         "next.reward": {"dtype": "float32", "shape": (1,), "names": None},
@@ -197,6 +209,7 @@ def _record(source: Source, repo_id: str, seed: int, episodes: range, root: Path
 def episode_frames(robot: LatentSafeFrankaMujoco, source: Source, episode: int, seed: int) -> Iterator[dict]:
     """The frames of an episode as `LeRobotDataset.add_frame` takes them; the first failing frame and all after fail."""
     scene, pushes, failed = robot.scene, _begin(robot, source, episode, _scene_seed(seed, source, episode)), False
+    told = LOCATION if source.told else {}
     with _operator(robot, source, episode) as operator:
         for step in _steps(PushedRobot(robot, pushes), operator):
             failed |= bool(step.before["failure"])
@@ -204,6 +217,7 @@ def episode_frames(robot: LatentSafeFrankaMujoco, source: Source, episode: int, 
                 "observation.images.front": step.seen["front"],
                 "observation.images.wrist": step.seen["wrist"],
                 "observation.state": np.array([step.seen[name] for name in STATE_NAMES], np.float32),
+                **{key: np.array([step.seen[name] for name in of["names"]], np.float32) for key, of in told.items()},
                 "action": step.action.astype(np.float32),
                 "failure": np.array([FAILING if failed else SAFE]),
                 "next.reward": np.array([step.info["reward"]], np.float32),
@@ -240,9 +254,11 @@ def _begin(robot: LatentSafeFrankaMujoco, source: Source, episode: int, scene_se
     if source.branches:
         n_frames -= _grasp(robot, scene_seed, source)
     rng = np.random.default_rng([8, scene_seed])
-    if rng.random() < source.astray:
-        bag: BagScene = scene
-        _go(robot, stray(bag, GRASPED[source.behavior(episode)], rng))
+    if source.behavior(episode) == "regrasp":
+        _grasp(robot, scene_seed, source)
+        _go(robot, lower(scene, rng))
+    elif rng.random() < source.astray:
+        _go(robot, stray(scene, GRASPED[source.behavior(episode)], rng))
     return _pushes(source.pushed / info.fps, n_frames, rng)
 
 
@@ -304,7 +320,7 @@ class PushedRobot:
 
     def observe(self) -> dict:
         """An observation of a LeRobot robot."""
-        return self.robot.get_observation()
+        return {**self.robot.get_observation(), **self.robot.scene.location()}
 
     def step(self, action: np.ndarray) -> None:
         """Act (7,), within limits."""

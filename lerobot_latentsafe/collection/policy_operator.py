@@ -6,17 +6,20 @@ from typing import Any
 import numpy as np
 import torch
 from lerobot.policies.utils import prepare_observation_for_inference
-from lerobot.utils.constants import OBS_IMAGES, OBS_STATE, OBS_STR
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE, OBS_STR
 from lerobot.utils.feature_utils import build_dataset_frame
 
 from lerobot_latentsafe.base_policy import BasePolicy
 from lerobot_latentsafe.collection.interventions import Interventions, InterventionStyle
 from lerobot_latentsafe.decision import LawOptions
 from lerobot_latentsafe.franka.actions import ACTION_NAMES, STATE_NAMES, action_limits
+from lerobot_latentsafe.franka.bag import LOCATION_NAMES
 from lerobot_latentsafe.franka.scene import CAMERAS
 from lerobot_latentsafe.guard import standing_still
 from lerobot_latentsafe.modeling_latentsafe import load_filter
 
+LOCATION = {OBS_ENV_STATE: {"dtype": "float32", "shape": (len(LOCATION_NAMES),), "names": LOCATION_NAMES}}
+"""Where the bag is, for policies that are told instead of looking."""
 OBSERVED = {
     OBS_STATE: {"dtype": "float32", "shape": (len(STATE_NAMES),), "names": STATE_NAMES},
     **{f"{OBS_IMAGES}.{name}": {"dtype": "image"} for name in CAMERAS},
@@ -39,7 +42,7 @@ def check_policy(path: str, fps: int, image_size: int) -> None:
     if policy.origin.fps not in (None, fps):
         raise ValueError(f"policy {path} acts at {policy.origin.fps} fps, the simulated robot at {fps}")
     black = np.zeros((image_size, image_size, 3), np.uint8)
-    seen = {**dict.fromkeys(STATE_NAMES, 0.0), **dict.fromkeys(CAMERAS, black)}
+    seen = {**dict.fromkeys([*STATE_NAMES, *LOCATION_NAMES], 0.0), **dict.fromkeys(CAMERAS, black)}
     try:
         policy.reset()
         action = policy.propose(_batch(seen))
@@ -54,7 +57,8 @@ def check_policy(path: str, fps: int, image_size: int) -> None:
 
 def _batch(seen: Mapping[str, Any]) -> dict[str, torch.Tensor]:
     """An observation of a LeRobot robot as policies take it."""
-    return prepare_observation_for_inference(build_dataset_frame(OBSERVED, seen, OBS_STR), torch.device("cpu"))
+    features = {**OBSERVED, **LOCATION} if {*LOCATION_NAMES} <= {*seen} else OBSERVED
+    return prepare_observation_for_inference(build_dataset_frame(features, seen, OBS_STR), torch.device("cpu"))
 
 
 class PolicyOperator:

@@ -5,6 +5,7 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
 from lerobot_latentsafe.evaluation.rollouts import Choice
@@ -27,6 +28,9 @@ class Scene(Protocol):
 
     def proprioception(self) -> np.ndarray:
         """The state (S,), float32."""
+
+    def location(self) -> dict[str, float]:
+        """What policies may be told that are not to look; most scenes tell nothing."""
 
     def step(self, action: np.ndarray) -> None:
         """Advance one control step under an action (A,)."""
@@ -55,7 +59,9 @@ class SceneWorld:
             f"observation.images.{name}": torch.from_numpy(self.scene.render(name)).permute(2, 0, 1)[None] / 255.0
             for name in self.cameras
         }
-        return {**images, "observation.state": torch.from_numpy(self.scene.proprioception())[None]}
+        told = self.scene.location()
+        located = {OBS_ENV_STATE: torch.tensor([[*told.values()]])} if told else {}
+        return {**images, **located, OBS_STATE: torch.from_numpy(self.scene.proprioception())[None]}
 
     def step(self, action: np.ndarray) -> None:
         """Act (1, A) in robot units."""

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from lerobot_latentsafe.franka.actions import GRIPPER_WIDTH
+from lerobot_latentsafe.franka.actions import GRIPPER_WIDTH, POINTING_DOWN
 from lerobot_latentsafe.franka.scene import TIMESTEP, FrankaScene
 from lerobot_latentsafe.franka.scenes import check_scene
 
@@ -39,6 +39,11 @@ SPILL_MARGIN = 0.004
 """A candy counts as spilled when its centre is this far outside the pouch, m."""
 CANDY_COLOURS = ("0.8 0.1 0.1", "0.95 0.5 0.05", "0.95 0.85 0.1", "0.15 0.6 0.15", "0.4 0.1 0.5")
 TAIL, MIDDLE, MOUTH = 0, 3, SEGMENTS - 1
+WAYS = [f"{part}_{axis}" for part in ("closed_end", "middle") for axis in "xyz"] + ["bag_yaw"]
+LOCATION_NAMES = [*WAYS, *(f"{name}_near" for name in WAYS)]
+"""Of `BagScene.location`."""
+NEAR = np.array([0.02] * 6 + [0.2])
+"""Ways (m) and turn (rad) up to which a policy is told in detail: 20 mm beside is of no use."""
 
 
 @dataclass(frozen=True)
@@ -237,6 +242,19 @@ class BagScene(FrankaScene):
     def segment_position(self, k: int) -> np.ndarray:
         """Centre of a segment (3,)."""
         return self.data.xpos[self.bodies[k]].copy()
+
+    def location(self) -> dict[str, float]:
+        """Where closed end and middle are as seen from the hand, m, how far it must turn, rad, and all of it enlarged.
+
+        For policies that are told where the bag is, instead of looking: see LOCATION_NAMES.
+        """
+        hand, rotation = self.tool_pose()
+        tail, middle, mouth = map(self.segment_position, (TAIL, MIDDLE, MOUTH))
+        bag, turned = mouth - tail, rotation @ POINTING_DOWN.T
+        turn = np.arctan2(bag[1], bag[0]) - np.arctan2(turned[1, 0], turned[0, 0])
+        turn = (turn + np.pi / 2) % np.pi - np.pi / 2  # the hand looks the same after half a turn
+        ways = np.array([*(tail - hand), *(middle - hand), turn])
+        return dict(zip(LOCATION_NAMES, np.concatenate([ways, np.tanh(ways / NEAR)]).tolist()))
 
     def held_segment(self) -> int | None:
         """The segment in the fingers."""

@@ -93,30 +93,25 @@ def lift(scene: bag.BagScene, segment: int, speed: float, rng: np.random.Generat
 
 
 def lift_nearer(scene: bag.BagScene, speed: float, rng: np.random.Generator) -> Actions:
-    """Lift the bag by its closed end where that is nearer to the arm's base than the open one, else by its middle.
-
-    A third of the time the closed end is put down again, and the middle is lifted: what to do where the first grasp was
-    a bad one.
-    """
+    """Lift the bag by its closed end where that is nearer to the arm's base than the open one, else by its middle."""
     closed, opened = (np.linalg.norm(scene.segment_position(k)[:2]) for k in (bag.TAIL, bag.MOUTH))
-    if opened <= closed:
-        yield from lift(scene, bag.MIDDLE, speed, rng)
-    elif rng.random() < 0.65:
-        yield from lift(scene, bag.TAIL, speed, rng)
-    else:
-        yield from grasp(scene, bag.TAIL, rng, 0.18)
-        yield from put_down(scene, speed, rng)
-        yield from lift(scene, bag.MIDDLE, speed, rng, LET_GO)
+    yield from lift(scene, bag.TAIL if closed < opened else bag.MIDDLE, speed, rng)
 
 
-def put_down(scene: bag.BagScene, speed: float, rng: np.random.Generator) -> Actions:
-    """Raise a grasped bag by a few centimetres or not at all, put it down, let go and rise."""
-    if rng.random() < 0.7:
-        yield from reach(scene, scene.controller.position + up(rng.uniform(0, 0.04)), speed, CLOSED)
-        yield from hold(CLOSED, int(rng.integers(5)))
-    yield from reach(scene, np.append(scene.controller.position[:2], 0.026), 0.2, CLOSED)
+def lower(scene: bag.BagScene, rng: np.random.Generator) -> Actions:
+    """Raise a grasped bag and begin to lower it, as an operator does who was stopped by a filter."""
+    height = rng.uniform(0.03, 0.15)
+    yield from reach(scene, scene.controller.position + up(height), 0.2, CLOSED)
+    yield from hold(CLOSED, int(rng.integers(4)))
+    yield from reach(scene, scene.controller.position - up(rng.uniform(0.02, 0.7 * height)), 0.1, CLOSED)
+
+
+def regrasp(scene: bag.BagScene, speed: float, rng: np.random.Generator) -> Actions:
+    """From a bag that is being lowered: put it down, let go, and lift it by its middle."""
+    yield from reach(scene, np.append(scene.controller.position[:2], 0.026), rng.uniform(0.08, 0.15), CLOSED)
     yield from hold(LET_GO, 6)
     yield from reach(scene, scene.controller.position + up(0.05), 0.2, LET_GO)
+    yield from lift(scene, bag.MIDDLE, speed, rng, LET_GO)
 
 
 def swing(scene: bag.BagScene, segment: int, speed: float, rng: np.random.Generator) -> Actions:
@@ -294,6 +289,7 @@ BAG: dict[str, tuple[Callable[..., Actions], tuple[float, float]]] = {
     "middle": (lambda scene, speed, rng: lift(scene, bag.MIDDLE, speed, rng), (0.10, 0.25)),
     "closed_end": (lambda scene, speed, rng: lift(scene, bag.TAIL, speed, rng), (0.15, MAX_SPEED)),
     "nearer": (lift_nearer, (0.10, 0.25)),
+    "regrasp": (regrasp, (0.10, 0.25)),
     "side_to_side": (lambda scene, speed, rng: swing(scene, bag.TAIL, speed, rng), (0.08, MAX_SPEED)),
     "branch": (branch, (0.05, MAX_SPEED)),
     "climb": (climb, (0.10, MAX_SPEED)),

@@ -11,9 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from lerobot.configs.policies import PreTrainedConfig
 from lerobot.datasets.dataset_tools import add_features
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.processor import DeviceProcessorStep
+from lerobot.processor import DeviceProcessorStep, PolicyProcessorPipeline
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
@@ -168,7 +169,30 @@ def let_see(checkpoint: str | Path, cache_root: str | Path, seen: str | Path, ou
     # After images are batched and on the device, before anything is normalised.
     at = next(i for i, s in enumerate(pre.steps) if isinstance(s, DeviceProcessorStep)) + 1
     pre.steps.insert(at, step)
-    if levels := few_valued(cache.action):
+    _write(config, checkpoint, pre, post, cache.action, output_dir)
+
+
+def let_be_told(checkpoint: str | Path, action: np.ndarray, output_dir: str | Path) -> None:
+    """Write a policy that was trained on where things are, and reads that wherever it runs.
+
+    Args:
+        action: (N, A), the demonstrations' commands.
+
+    Raises:
+        FileExistsError: output_dir exists.
+    """
+    checkpoint, output_dir = Path(checkpoint), Path(output_dir)
+    refuse_existing(output_dir)
+    config = read_config(checkpoint, "cpu")
+    _write(config, checkpoint, *load_processors(config, checkpoint, "cpu"), action, output_dir)
+
+
+def _write(
+    config: PreTrainedConfig, checkpoint: Path, pre: PolicyProcessorPipeline, post: PolicyProcessorPipeline,
+    action: np.ndarray, output_dir: Path,
+) -> None:  # fmt: skip
+    """Write weights and processors; commands of two or three values in the data (N, A) take no others."""
+    if levels := few_valued(action):
         post.steps.append(FewValuedStep(levels))
     with replacing_folder(output_dir) as folder:
         folder.mkdir()

@@ -44,6 +44,10 @@ class Drawn:
         self._renderer.update_scene(self.data, camera)
         return self._renderer.render()
 
+    def location(self) -> dict[str, float]:
+        """What policies may be told that are not to look, number by number; most scenes tell nothing."""
+        return {}
+
     def close(self) -> None:
         """Free the OpenGL context."""
         if self._renderer is not None:

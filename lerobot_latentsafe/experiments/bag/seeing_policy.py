@@ -11,20 +11,24 @@ from lerobot.common.train_utils import load_training_state, save_checkpoint, upd
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.datasets.dataset_tools import remove_feature
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.optim.factory import make_optimizer_and_scheduler
 from lerobot.policies.factory import make_policy, make_pre_post_processors
+from lerobot.utils.constants import OBS_ENV_STATE
 from tqdm import trange
 
 from lerobot_latentsafe.datasets.frame_cache import FOLDER, MANIFEST, FrameCache
 from lerobot_latentsafe.datasets.windows import Windows
-from lerobot_latentsafe.policies.grasp_training import AIM, SWITCH, check_seen, let_see, switched, with_aim
+from lerobot_latentsafe.policies.grasp_training import AIM, SWITCH, check_seen, let_be_told, let_see, switched, with_aim
+from lerobot_latentsafe.runtime.files import replacing_folder
 from lerobot_latentsafe.runtime.hub import halve_weights
 
 OPEN_FINGERS = 3
 """How much likelier a frame before the fingers close is drawn: what is hard is to get there."""
-CONFIG = Path(__file__).parents[3] / "configs" / "bag_diffusion.yaml"
+CONFIGS = Path(__file__).parents[3] / "configs"
+SEES, IS_TOLD = CONFIGS / "bag_diffusion.yaml", CONFIGS / "bag_diffusion_told.yaml"
 
 
 def drawn_windows(dataset: LeRobotDataset, config: PreTrainedConfig) -> Windows:
@@ -84,7 +88,7 @@ def train_seeing_policy(
     dataset: Path, repo_id: str, output: Path, steps: int | None = None, seed: int | None = None, half: bool = False,
     device: str = "cpu",
 ) -> None:  # fmt: skip
-    """Encode demonstrations, learn to aim, train a policy on that, and write one that sees by itself.
+    """Train a policy on demonstrations: one that sees by itself, or one that is told where things are, if they say.
 
     Args:
         dataset: folder of the demonstrations.
@@ -93,15 +97,38 @@ def train_seeing_policy(
         half: store 16-bit weights.
         device: to train on.
     """
+    meta = LeRobotDatasetMetadata(repo_id, root=dataset)
+    told = OBS_ENV_STATE in meta.features
+    config = draccus.parse(TrainPipelineConfig, IS_TOLD if told else SEES, args=[])
+    config.steps, config.seed = steps or config.steps, seed or config.seed
+    config.policy.device = device
+    training = output.with_name(f"{output.name}_training")
+    if told:
+        blind = without_pictures(dataset, repo_id)
+        commands = np.stack(blind.hf_dataset.with_format("numpy")["action"])
+        let_be_told(train(config, blind, training), commands, output)
+    else:
+        _see(config, dataset, repo_id, training, output)
+    if half:
+        halve_weights(output)
+
+
+def without_pictures(dataset: Path, repo_id: str) -> LeRobotDataset:
+    """Demonstrations as a policy reads them that is told where things are; made unless it is there."""
+    blind, repo_id_told = dataset.with_name(f"{dataset.name}_told"), f"{repo_id}_told"
+    if not blind.exists():
+        whole = LeRobotDataset(repo_id, root=dataset)
+        with replacing_folder(blind) as folder:
+            remove_feature(whole, whole.meta.camera_keys, output_dir=folder, repo_id=repo_id_told)
+    return LeRobotDataset(repo_id_told, root=blind)
+
+
+def _see(config: TrainPipelineConfig, dataset: Path, repo_id: str, training: Path, output: Path) -> None:
+    """Encode demonstrations, learn to aim, train on that, and write a policy that sees by itself."""
+    device = config.policy.device
     tokens, seen = encode(dataset, repo_id), dataset.with_name(f"{dataset.name}_seen")
     if not (seen / AIM).exists():
         with_aim(tokens, f"{repo_id}_cache", seen, device=device)
     check_seen(seen, tokens)
-    config = draccus.parse(TrainPipelineConfig, CONFIG, args=[])
-    config.steps, config.seed = steps or config.steps, seed or config.seed
-    config.policy.device = device
     aimed = LeRobotDataset(f"{repo_id}_cache_seen", root=seen)
-    trained = train(config, aimed, output.with_name(f"{output.name}_training"))
-    let_see(trained, tokens, seen, output)
-    if half:
-        halve_weights(output)
+    let_see(train(config, aimed, training), tokens, seen, output)
