@@ -49,7 +49,8 @@ class Collect:
     - bag_pulls: the same lifts, undisturbed
     - bag_swings: held by its closed end and swung, most of them too slowly to spill
     - bag_varied, bag_varied_pulls: lifts of bags that are stiffer or softer, heavier or lighter, rougher or smoother
-    - bag_middle, bag_strong, bag_weak, bag_mixed: demonstrations; in the last three the hand is pushed aside at times
+    - bag_middle, bag_strong, bag_weak, bag_mixed: demonstrations; in the last three the hand is pushed aside at times,
+      and bag_mixed says where the bag is
     - blocks_demos, blocks_random: the blocks
 
     Sources of the SO-101, which pushes a cube to a mark near the table's edge:
