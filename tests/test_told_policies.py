@@ -65,3 +65,8 @@ def test_a_policy_that_is_told_is_recorded_trained_and_acts(bag, monkeypatch, tm
     action = policy.propose(SceneWorld(bag, 1, cameras=()).observe())
     assert action.shape == (1, 7) and action.isfinite().all()
     check_policy(str(tmp_path / "policy"), SCENES["bag"].fps, 32)
+
+    franka.collect_franka("bag_mixed", "me/told", tmp_path / "others", 2, seed=1)
+    (tmp_path / "told_told").rename(tmp_path / "others_told")
+    with pytest.raises(ValueError, match="others_told was made of other demonstrations than those of"):
+        train_seeing_policy(tmp_path / "others", "me/told", tmp_path / "another", steps=2)

@@ -16,7 +16,7 @@ from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.optim.factory import make_optimizer_and_scheduler
 from lerobot.policies.factory import make_policy, make_pre_post_processors
-from lerobot.utils.constants import OBS_ENV_STATE
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE
 from tqdm import trange
 
 from lerobot_latentsafe.datasets.frame_cache import FOLDER, MANIFEST, FrameCache
@@ -114,13 +114,20 @@ def train_seeing_policy(
 
 
 def without_pictures(dataset: Path, repo_id: str) -> LeRobotDataset:
-    """Demonstrations as a policy reads them that is told where things are; made unless it is there."""
+    """Demonstrations as a policy reads them that is told where things are; made unless it is there.
+
+    Raises:
+        ValueError: what is there was made of others.
+    """
     blind, repo_id_told = dataset.with_name(f"{dataset.name}_told"), f"{repo_id}_told"
+    whole = LeRobotDataset(repo_id, root=dataset)
     if not blind.exists():
-        whole = LeRobotDataset(repo_id, root=dataset)
         with replacing_folder(blind) as folder:
             remove_feature(whole, whole.meta.camera_keys, output_dir=folder, repo_id=repo_id_told)
-    return LeRobotDataset(repo_id_told, root=blind)
+    told = LeRobotDataset(repo_id_told, root=blind)
+    if any(not np.array_equal(told.meta.stats[ACTION][key], of) for key, of in whole.meta.stats[ACTION].items()):
+        raise ValueError(f"{blind} was made of other demonstrations than those of {dataset}: delete {blind}")
+    return told
 
 
 def _see(config: TrainPipelineConfig, dataset: Path, repo_id: str, training: Path, output: Path) -> None:
